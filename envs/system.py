@@ -1,0 +1,193 @@
+"""A system: pure, batched dynamics with named states, from which environments, experts and models are made.
+
+A system is a frozen dataclass whose fields are its physical parameters. Its functions know no randomness and
+no time; they take arrays (..., n) of numpy or torch (the array API), so that one text serves the single
+environment, the batch of thousands of copies, the planner's derivatives and a physics filter:
+
+    s_{t+1} = f(s_t, u_t + sigma_u eps_u) + sigma_s eps_s,     y_t = h(s_t),     r_t = r(s_t, u_t, s_{t+1})
+
+with u_t clipped to the action limits and eps standard normal. To add a system: write one file with one
+subclass, and one line in registration.py.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from array_api_compat import array_namespace
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from beliefgym.envs.random_streams import RandomStreams
+    from beliefgym.envs.rendering import Canvas
+
+Array = Any  # an array of any namespace of the array API
+
+
+@dataclass(frozen=True, kw_only=True)
+class System(ABC):
+    """Base class of all systems; the parameters that every system has.
+
+    Args:
+        dt: control period in s.
+        process_noise_std: standard deviation of the noise added to the state after each step, in the units of
+            the state; one number for all components, or one each.
+        actuation_noise_std: standard deviation of the noise added to the clipped action, in its units; one
+            number, or one for each action.
+
+    Raises:
+        ValueError: a non-positive dt, a negative or non-finite noise, or a list of the wrong length.
+    """
+
+    dt: float = 0.05
+    process_noise_std: float | tuple[float, ...] = 0.0
+    actuation_noise_std: float | tuple[float, ...] = 0.0
+
+    state_names: ClassVar[tuple[str, ...]]
+    action_names: ClassVar[tuple[str, ...]]
+    observation_names: ClassVar[tuple[str, ...]]
+
+    def __post_init__(self) -> None:
+        if not self.dt > 0:
+            raise ValueError(f"expected dt above 0 s, got {self.dt!r}")
+        for name, size in (("process_noise_std", self.n_state), ("actuation_noise_std", self.n_action)):
+            value = getattr(self, name)
+            if not isinstance(value, int | float):
+                object.__setattr__(self, name, tuple(float(v) for v in value))
+            std = np.asarray(getattr(self, name), dtype=float)
+            if std.ndim and len(std) != size:
+                raise ValueError(f"expected {name} as one number or {size} of them, got {len(std)}")
+            if not (np.isfinite(std).all() and (std >= 0).all()):
+                raise ValueError(f"expected {name} finite and at least 0, got {value!r}")
+
+    @property
+    def n_state(self) -> int:
+        """Number of state components."""
+        return len(self.state_names)
+
+    @property
+    def n_action(self) -> int:
+        """Number of action components."""
+        return len(self.action_names)
+
+    @property
+    def noise_size(self) -> int:
+        """Standard normal numbers that one step takes: actions first, then states; 0 without noise."""
+        return (self.n_action + self.n_state) if np.any(self._noise_scale) else 0
+
+    @property
+    def _noise_scale(self) -> NDArray[np.float64]:
+        return np.concatenate(
+            [
+                np.broadcast_to(np.asarray(self.actuation_noise_std, dtype=float), self.n_action),
+                np.broadcast_to(np.asarray(self.process_noise_std, dtype=float), self.n_state),
+            ]
+        )
+
+    @property
+    @abstractmethod
+    def action_limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest action, each (n_action,)."""
+
+    @property
+    @abstractmethod
+    def observation_limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Bounds of the full observation, each (n_observation,); infinite where there is none."""
+
+    @abstractmethod
+    def flow(self, state: Array, action: Array) -> Array:
+        """The state one control period later, without noise and without limits on the action.
+
+        Args:
+            state: (..., n_state).
+            action: (..., n_action).
+
+        Returns:
+            (..., n_state).
+        """
+
+    @abstractmethod
+    def observe(self, state: Array) -> Array:
+        """The full observation of a state: (..., n_state) -> (..., n_observation)."""
+
+    @abstractmethod
+    def reward(self, state: Array, action: Array, next_state: Array) -> Array:
+        """Reward of a transition; the action is clipped to its limits already. Shape (...)."""
+
+    @abstractmethod
+    def initial_state(self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+        """Start states drawn from the start distribution, (n, n_state); only rows of the mask are drawn."""
+
+    def terminated(self, state: Array) -> Array:
+        """Where the task ends for good, bool (...); nowhere unless a system says so."""
+        xp = array_namespace(state)
+        return xp.zeros(state.shape[:-1], dtype=xp.bool)
+
+    def stage_cost(self, state: Array, action: Array) -> Array:
+        """What planners minimise, (...); the negative reward unless a system names a smoother one."""
+        return -self.reward(state, action, state)
+
+    def clip(self, action: Array) -> Array:
+        """The action within its limits, same shape."""
+        xp = array_namespace(action)
+        low, high = self.action_limits
+        if xp.__name__.endswith("numpy"):
+            return np.minimum(np.maximum(action, low), high)
+        return xp.minimum(xp.maximum(action, xp.asarray(low)), xp.asarray(high))
+
+    def step(self, state: Array, action: Array, noise: Array | None = None) -> Array:
+        """One control period with limits and noise.
+
+        Args:
+            state: (..., n_state).
+            action: (..., n_action), clipped to its limits here.
+            noise: (..., n_action + n_state) standard normal numbers, or None for none.
+
+        Returns:
+            (..., n_state).
+        """
+        action = self.clip(action)
+        if noise is None:
+            return self.flow(state, action)
+        noise = noise * array_namespace(noise).asarray(self._noise_scale)
+        return self.flow(state, action + noise[..., : self.n_action]) + noise[..., self.n_action :]
+
+    def expert(self) -> Any:
+        """A controller that knows the true model and the full state; see planning/.
+
+        Returns:
+            an object with `act(state, restart) -> action`, batched: state (n, n_state), restart (n,) bool where a
+            new episode has begun (its plan is made anew), action (n, n_action) within the limits.
+        """
+        raise ValueError(f"{type(self).__name__} has no expert; override System.expert to give it one")
+
+    def draw(self, canvas: Canvas, state: NDArray[np.float64], action: NDArray[np.float64] | None) -> None:
+        """Draw one state (n_state,) and the last action (n_action,) on a canvas."""
+        raise ValueError(f"{type(self).__name__} has no picture; override System.draw to give it one")
+
+
+def wrap_angle(angle: Array) -> Array:
+    """The same angle in [-pi, pi)."""
+    return angle - 2.0 * np.pi * array_namespace(angle).floor(angle / (2.0 * np.pi) + 0.5)
+
+
+def build_system(system_class: type[System], parameters: dict[str, Any]) -> System:
+    """A system from its class and parameters by name.
+
+    Raises:
+        TypeError: an unknown parameter; the message names the nearest and lists all.
+    """
+    known = [field.name for field in fields(system_class)]
+    for name in parameters:
+        if name not in known:
+            near = get_close_matches(name, known, n=1)
+            raise TypeError(
+                f"{system_class.__name__} has no parameter {name!r}"
+                + (f"; did you mean {near[0]!r}?" if near else "")
+                + f" (its parameters: {', '.join(known)})"
+            )
+    return system_class(**{k: tuple(v) if isinstance(v, list) else v for k, v in parameters.items()})
