@@ -1,0 +1,116 @@
+"""The expert: a planner that knows the true model and reads the true state. The one of every leaderboard score.
+
+It does not play by the agents' rules (it sees the full state of a partially observed task), so it is a reference,
+not a competitor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from beliefgym.agents.agent import Agent, episode_starts
+from beliefgym.envs.system import System
+from beliefgym.wrappers.task import Task
+
+
+class Expert(Agent):
+    """The expert controller of a task's system, in SB3's face.
+
+    It must know the environment it acts in, because an observation does not hold the state: call
+    `set_env(env)` with the single, vector or SB3 vector environment first (`evaluate` does).
+
+    Args:
+        task: a task on a beliefgym system.
+        seed: not used; the expert is deterministic.
+
+    Raises:
+        ValueError: the environment is not made from a `System`.
+    """
+
+    def __init__(self, task: Task | str, seed: int = 0) -> None:
+        super().__init__(task, seed)
+        env = self.task.make_vec(1)
+        system = getattr(env.unwrapped, "system", None)
+        env.close()
+        if not isinstance(system, System):
+            raise ValueError(
+                f"{self.task.env_id} has no expert: it is not made from a beliefgym System; "
+                "`beliefgym envs` marks those that have one"
+            )
+        self.system = system
+        self._controller = system.expert()
+        self._env: Any = None
+
+    def learn(self, total_timesteps: int, callback: Any = None, progress_bar: bool = False) -> Self:
+        """Nothing to learn."""
+        return self
+
+    def set_env(self, env: Any) -> None:
+        """The environment whose state is read.
+
+        Raises:
+            TypeError: not an environment.
+        """
+        if not isinstance(env, gym.Env | VectorEnv | VecEnv):
+            raise TypeError(f"expected an environment, got {type(env).__name__}")
+        self._env = env
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], Any]:
+        """See `Agent.predict`; the state only says that the episode goes on.
+
+        Raises:
+            RuntimeError: `set_env` was not called.
+            ValueError: the environment has another number of copies than the observation.
+        """
+        if self._env is None:
+            raise RuntimeError("the expert reads the true state: call set_env(env) with the environment it acts in")
+        observation, single = self.batched(observation)
+        true_state = self._true_state()
+        if len(true_state) != len(observation):
+            raise ValueError(f"the environment has {len(true_state)} copies, the observation {len(observation)}")
+        action = self._controller.act(true_state, episode_starts(state, episode_start, len(observation)))
+        return self._in_action_space(action, single), True
+
+    def _true_state(self) -> NDArray[np.float64]:
+        if isinstance(self._env, gym.Env):
+            return np.asarray(self._env.unwrapped.state)[None]  # type: ignore[attr-defined]
+        if isinstance(self._env, VectorEnv):
+            return np.asarray(self._env.unwrapped.state)  # type: ignore[attr-defined]
+        return np.stack(self._env.get_attr("state"))
+
+    def _in_action_space(self, action: NDArray[np.float64], single: bool) -> NDArray[Any]:
+        chosen: NDArray[Any] = action.astype(np.float32)
+        if not isinstance(self.action_space, gym.spaces.Box):
+            table = _discrete_table(self.task)
+            chosen = np.argmin(np.abs(action[:, None, :] - table[None]).sum(axis=2), axis=1)
+        return chosen[0] if single else chosen
+
+    def parts(self) -> dict[str, bytes]:
+        """Nothing beyond the header."""
+        return {}
+
+    def restore(self, parts: Mapping[str, bytes]) -> None:
+        """Nothing to restore."""
+
+
+def _discrete_table(task: Task) -> NDArray[np.float64]:
+    """(bins, n_action) the continuous action behind each discrete one."""
+    env: Any = task.make()
+    while not hasattr(env, "action_table"):
+        if env is env.unwrapped:
+            raise ValueError(f"the expert cannot act in the action space {task.make().action_space}")
+        env = env.env
+    return np.asarray(env.action_table)

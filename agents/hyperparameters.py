@@ -1,0 +1,123 @@
+"""Hyperparameters of the Stable-Baselines3 agents, by task.
+
+The pendulum's are those that rl-zoo3 publishes: PPO and SAC for Pendulum-v1, recurrent PPO for the position-only
+pendulum. The cart-pole's were chosen here on validation seeds. A key is the start of an environment's name; "" is
+for every other environment. An agent with stacked frames takes the settings of the one without.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+_RECURRENT = {
+    "policy": "MlpLstmPolicy",
+    "policy_kwargs": {
+        "net_arch": [64],
+        "activation_fn": "relu",
+        "ortho_init": False,
+        "lstm_hidden_size": 64,
+        "enable_critic_lstm": True,
+    },
+}
+
+HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
+    "PPO": {
+        "": {"n_envs": 8, "normalize": True, "arguments": {"policy": "MlpPolicy", "n_steps": 256, "batch_size": 256}},
+        "Pendulum": {
+            "n_envs": 4,
+            "arguments": {
+                "policy": "MlpPolicy",
+                "n_steps": 1024,
+                "gae_lambda": 0.95,
+                "gamma": 0.9,
+                "n_epochs": 10,
+                "ent_coef": 0.0,
+                "learning_rate": 1e-3,
+                "clip_range": 0.2,
+                "use_sde": True,
+                "sde_sample_freq": 4,
+            },
+        },
+        "CartPoleSwingUp": {
+            "n_envs": 8,
+            "normalize": True,
+            "rescale_actions": True,
+            "arguments": {
+                "policy": "MlpPolicy",
+                "n_steps": 256,
+                "batch_size": 128,
+                "gae_lambda": 0.95,
+                "gamma": 0.98,
+                "n_epochs": 10,
+                "learning_rate": 1e-3,
+                "use_sde": True,
+                "sde_sample_freq": 4,
+            },
+        },
+    },
+    "SAC": {
+        "": {"n_envs": 1, "arguments": {"policy": "MlpPolicy", "buffer_size": 300_000}},
+        "Pendulum": {
+            "n_envs": 4,
+            "arguments": {
+                "policy": "MlpPolicy",
+                "learning_rate": 1e-3,
+                "buffer_size": 100_000,
+                "gradient_steps": -1,
+            },
+        },
+        "CartPoleSwingUp": {
+            "n_envs": 4,
+            "arguments": {
+                "policy": "MlpPolicy",
+                "learning_rate": 1e-3,
+                "buffer_size": 100_000,
+                "gamma": 0.98,
+                "gradient_steps": -1,
+                "learning_starts": 1000,
+            },
+        },
+    },
+    "RecurrentPPO": {
+        "": {"n_envs": 8, "normalize": True, "arguments": {**_RECURRENT, "n_steps": 256}},
+        "Pendulum": {
+            "n_envs": 4,
+            "normalize": True,
+            "arguments": {
+                **_RECURRENT,
+                "n_steps": 1024,
+                "gae_lambda": 0.95,
+                "gamma": 0.9,
+                "n_epochs": 10,
+                "ent_coef": 0.0,
+                "learning_rate": 1e-3,
+                "clip_range": 0.2,
+                "use_sde": True,
+                "sde_sample_freq": 4,
+            },
+        },
+        "CartPoleSwingUp": {
+            "n_envs": 8,
+            "normalize": True,
+            "rescale_actions": True,
+            "arguments": {
+                **_RECURRENT,
+                "n_steps": 256,
+                "gae_lambda": 0.95,
+                "gamma": 0.98,
+                "n_epochs": 10,
+                "learning_rate": 1e-3,
+                "use_sde": True,
+                "sde_sample_freq": 4,
+            },
+        },
+    },
+}
+
+
+def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
+    """Constructor arguments of `SB3Agent` for an algorithm on an environment: the longest key that fits."""
+    table = HYPERPARAMETERS.get(algorithm, {"": {"arguments": {"policy": "MlpPolicy"}}})
+    name = env_id.rpartition("/")[2]
+    key = max((key for key in table if name.startswith(key)), key=len)
+    return {"algorithm": algorithm, **table[key]}
