@@ -70,6 +70,7 @@ class Agent(ABC):
 
     def set_env(self, env: Any) -> None:
         """Told which environment is about to be acted in; only agents that read the true state care."""
+        del env
 
     @abstractmethod
     def parts(self) -> dict[str, bytes]:
@@ -148,7 +149,9 @@ class Agent(ABC):
             return observation[None], True
         if observation.shape[1:] == shape:
             return observation, False
-        raise ValueError(f"expected an observation of shape {shape}, or a batch (n, *{shape}), got {observation.shape}")
+        raise ValueError(
+            f"expected an observation of shape {shape}, or a batch (n, *{shape}), got {observation.shape}"
+        )
 
 
 def episode_starts(state: Any, episode_start: NDArray[np.bool_] | None, n: int) -> NDArray[np.bool_]:
@@ -167,7 +170,9 @@ def require_box(space: Space[Any], who: str) -> Box:
         ValueError: otherwise.
     """
     if not isinstance(space, Box) or len(space.shape) != 1:
-        raise ValueError(f"{who} needs a flat Box space, got {space}; flatten it with a Gymnasium wrapper first")
+        raise ValueError(
+            f"{who} needs a flat Box space, got {space}; flatten it with a Gymnasium wrapper first"
+        )
     return space
 
 
@@ -206,5 +211,7 @@ def read_archive(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
             f"{path} is not a saved beliefgym agent ({error}); an SB3 model of your own is loaded with SB3's load"
         ) from error
     if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT}, got {header.get('format')!r}; save it with this version")
+        raise ValueError(
+            f"{path}: expected format {FORMAT}, got {header.get('format')!r}; save it with this version"
+        )
     return header, parts

@@ -26,7 +26,11 @@ class Evaluation:
     @property
     def standard_error(self) -> float:
         """Standard error of the mean return over episodes."""
-        return float(self.returns.std(ddof=1) / np.sqrt(len(self.returns))) if len(self.returns) > 1 else float("nan")
+        return (
+            float(self.returns.std(ddof=1) / np.sqrt(len(self.returns)))
+            if len(self.returns) > 1
+            else float("nan")
+        )
 
 
 def evaluate(
@@ -67,7 +71,9 @@ def evaluate(
     state: Any = None
     start = np.ones(n_episodes, dtype=np.bool_)
     for _ in range(max_steps):
-        action, state = agent.predict(observation, state=state, episode_start=start, deterministic=deterministic)
+        action, state = agent.predict(
+            observation, state=state, episode_start=start, deterministic=deterministic
+        )
         observation, reward, terminated, truncated, _ = env.step(action)
         returns += np.where(running, reward, 0.0)
         lengths += running

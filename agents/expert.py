@@ -76,11 +76,15 @@ class Expert(Agent):
             ValueError: the environment has another number of copies than the observation.
         """
         if self._env is None:
-            raise RuntimeError("the expert reads the true state: call set_env(env) with the environment it acts in")
+            raise RuntimeError(
+                "the expert reads the true state: call set_env(env) with the environment it acts in"
+            )
         observation, single = self.batched(observation)
         true_state = self._true_state()
         if len(true_state) != len(observation):
-            raise ValueError(f"the environment has {len(true_state)} copies, the observation {len(observation)}")
+            raise ValueError(
+                f"the environment has {len(true_state)} copies, the observation {len(observation)}"
+            )
         action = self._controller.act(true_state, episode_starts(state, episode_start, len(observation)))
         return self._in_action_space(action, single), True
 

@@ -22,7 +22,11 @@ _RECURRENT = {
 
 HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
     "PPO": {
-        "": {"n_envs": 8, "normalize": True, "arguments": {"policy": "MlpPolicy", "n_steps": 256, "batch_size": 256}},
+        "": {
+            "n_envs": 8,
+            "normalize": True,
+            "arguments": {"policy": "MlpPolicy", "n_steps": 256, "batch_size": 256},
+        },
         "Pendulum": {
             "n_envs": 4,
             "arguments": {
@@ -47,11 +51,9 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
                 "n_steps": 256,
                 "batch_size": 128,
                 "gae_lambda": 0.95,
-                "gamma": 0.98,
+                "gamma": 0.99,
                 "n_epochs": 10,
                 "learning_rate": 1e-3,
-                "use_sde": True,
-                "sde_sample_freq": 4,
             },
         },
     },
@@ -104,11 +106,9 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
                 **_RECURRENT,
                 "n_steps": 256,
                 "gae_lambda": 0.95,
-                "gamma": 0.98,
+                "gamma": 0.99,
                 "n_epochs": 10,
                 "learning_rate": 1e-3,
-                "use_sde": True,
-                "sde_sample_freq": 4,
             },
         },
     },

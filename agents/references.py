@@ -60,7 +60,11 @@ def references(task: Task | str, n_episodes: int = N_EPISODES) -> References:
         ValueError: the environment has no expert.
     """
     task = task if isinstance(task, Task) else Task(task)
-    if not task.kwargs and not any(name == "DiscreteActions" for name, _ in task.wrappers) and task.env_id in _table():
+    if (
+        not task.kwargs
+        and not any(name == "DiscreteActions" for name, _ in task.wrappers)
+        and task.env_id in _table()
+    ):
         return References(**_table()[task.env_id])
     return measure(task, n_episodes)
 
@@ -68,7 +72,8 @@ def references(task: Task | str, n_episodes: int = N_EPISODES) -> References:
 def measure(task: Task | str, n_episodes: int = N_EPISODES) -> References:
     """Run the random policy and the expert on a task."""
     random, expert = (
-        evaluate(make_agent(name, task, seed=SEED), task, n_episodes, seed=SEED) for name in ("random", "expert")
+        evaluate(make_agent(name, task, seed=SEED), task, n_episodes, seed=SEED)
+        for name in ("random", "expert")
     )
     return References(random.mean, expert.mean, random.standard_error, expert.standard_error)
 
@@ -81,6 +86,8 @@ def measure_all(env_ids: Iterable[str], path: Path = PATH, told: Callable[[str],
         told(f"{env_id}: random {found.random:.1f}, expert {found.expert:.1f}")
         table[env_id] = {name: round(value, 4) for name, value in vars(found).items()}
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps({"n_episodes": N_EPISODES, "seed": SEED, "references": table}, indent=1) + "\n")
+    temporary.write_text(
+        json.dumps({"n_episodes": N_EPISODES, "seed": SEED, "references": table}, indent=1) + "\n"
+    )
     os.replace(temporary, path)
     _table.cache_clear()

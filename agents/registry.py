@@ -101,7 +101,9 @@ def make_agent(name: str, task: Task | str, seed: int = 0, **options: Any) -> Ag
         agent: Agent = _load(spec.entry_point)(task, seed=seed, **chosen)
     except TypeError as error:
         if "unexpected keyword argument" in str(error):
-            raise TypeError(f"agent {name!r}: {error}; it takes {', '.join(sorted(chosen)) or 'no options'}") from error
+            raise TypeError(
+                f"agent {name!r}: {error}; it takes {', '.join(sorted(chosen)) or 'no options'}"
+            ) from error
         raise
     agent.registered_name = spec.name
     return agent
@@ -135,7 +137,9 @@ def _sb3(algorithm: str, **more: Any) -> Callable[[str], dict[str, Any]]:
 _SB3 = "beliefgym.agents.sb3_agent:SB3Agent"
 
 for _spec in (
-    AgentSpec("random", "beliefgym.agents.random_agent:RandomAgent", "uniform actions; score 0", learns=False),
+    AgentSpec(
+        "random", "beliefgym.agents.random_agent:RandomAgent", "uniform actions; score 0", learns=False
+    ),
     AgentSpec("expert", "beliefgym.agents.expert:Expert", "true model and full state; score 1", learns=False),
     AgentSpec("ppo", _SB3, "SB3's PPO on the last observation alone", _sb3("PPO")),
     AgentSpec("ppo-stack", _SB3, "SB3's PPO on the last 4 observations", _sb3("PPO", n_stack=4)),

@@ -191,18 +191,20 @@ class SB3Agent(Agent):
     def restore(self, parts: Mapping[str, bytes]) -> None:
         """See `Agent.restore`. SB3's file holds pickled fields: open only files that you trust."""
         env = self.model.get_env()
-        self.model = _algorithm_class(self.algorithm).load(io.BytesIO(parts["model.zip"]), env=env, device="cpu")
+        self.model = _algorithm_class(self.algorithm).load(
+            io.BytesIO(parts["model.zip"]), env=env, device="cpu"
+        )
         self._learned = True
         if self._normalizer is not None:
             with np.load(io.BytesIO(parts["normalisation.npz"]), allow_pickle=False) as moments:
-                for rms, name, count in zip(
+                running: Any = zip(
                     (self._normalizer.obs_rms, self._normalizer.ret_rms),
-                    ("observation", "reward"),
+                    (moments["observation"], moments["reward"]),
                     moments["counts"],
                     strict=True,
-                ):
-                    rms.mean, rms.var = moments[name]  # type: ignore[union-attr]
-                    rms.count = float(count)  # type: ignore[union-attr]
+                )
+                for rms, (mean, variance), count in running:
+                    rms.mean, rms.var, rms.count = mean, variance, float(count)
 
     def _training_env(self, n_envs: int) -> tuple[VecEnv, UnitActions | None, VecNormalize | None]:
         env: VecEnv = SB3VecEnv(self.task.make_vec(n_envs))

@@ -89,7 +89,13 @@ class CartPole(System):
         xp = array_namespace(state)
         velocity, theta, w = state[..., 1], state[..., 2], state[..., 3]
         force = action[..., 0]
-        total, m, length, f, g = self.cart_mass + self.pole_mass, self.pole_mass, self.length, self.friction, self.gravity
+        total, m, length, f, g = (
+            self.cart_mass + self.pole_mass,
+            self.pole_mass,
+            self.length,
+            self.friction,
+            self.gravity,
+        )
         s, c = xp.sin(theta), xp.cos(theta)
         d = self.cart_mass + m * (s * s)
         push = (m * length) * (w * w) * s + force
@@ -128,7 +134,9 @@ class CartPole(System):
         """Where the cart has left the track."""
         return array_namespace(state).abs(state[..., 0]) > self.track
 
-    def initial_state(self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    def initial_state(
+        self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float64]:
         """Hanging, every component within +-start_spread."""
         spread = (2.0 * streams.uniform(4, mask) - 1.0) * self.start_spread
         return spread + np.array([0.0, 0.0, np.pi, 0.0])

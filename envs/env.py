@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -53,7 +53,7 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         **parameters: the system's parameters by name; an unknown one is an error.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": 20}
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 20}
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.system.dt))}
         self.render_mode = render_mode
         self._observe = Observer(self.system, components)
-        self.observation_space = self._observe.space
+        self.observation_space: Box = self._observe.space  # type: ignore[assignment]
         self.action_space = action_space(self.system)
         self._hint = hint
         self._simulation = Simulation(self.system, 1, type(self.system).__name__)
@@ -125,7 +125,9 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The picture (height, width, 3) in mode "rgb_array"; shown in a window in mode "human"."""
         if self.render_mode is None:
-            gym.logger.warn('render() without a render_mode; make the environment with render_mode="rgb_array"')
+            gym.logger.warn(
+                'render() without a render_mode; make the environment with render_mode="rgb_array"'
+            )
             return None
         from beliefgym.envs.rendering import Window, picture
 

@@ -40,7 +40,7 @@ class Observer:
         prefix = index == list(range(len(index)))
         self._system = system
         self._columns: slice | list[int] | None = None
-        if components is not None and len(index) < len(available) or not prefix:
+        if (components is not None and len(index) < len(available)) or not prefix:
             self._columns = slice(0, len(index)) if prefix else index
         low, high = system.observation_limits
         self.space = Box(low[index].astype(np.float32), high[index].astype(np.float32), dtype=np.float32)

@@ -79,7 +79,13 @@ class Pendulum(System):
     @classmethod
     def uncontrolled(cls, damping: float = 0.0, **parameters: Any) -> Pendulum:
         """The free pendulum of the thesis proposal: point mass, g = 9.81 m/s^2, RK4, no torque, no speed limit."""
-        free = {"gravity": 9.81, "inertia": "point", "integrator": "rk4", "max_torque": 0.0, "max_speed": np.inf}
+        free: dict[str, Any] = {
+            "gravity": 9.81,
+            "inertia": "point",
+            "integrator": "rk4",
+            "max_torque": 0.0,
+            "max_speed": np.inf,
+        }
         return cls(damping=damping, **(free | parameters))
 
     @property
@@ -130,7 +136,9 @@ class Pendulum(System):
         theta, speed, torque = wrap_angle(state[..., 0]), state[..., 1], action[..., 0]
         return -(theta * theta + 0.1 * (speed * speed) + 0.001 * (torque * torque))
 
-    def initial_state(self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    def initial_state(
+        self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float64]:
         """Angle and speed uniform within their start ranges."""
         return (2.0 * streams.uniform(2, mask) - 1.0) * np.array([self.start_angle, self.start_speed])
 

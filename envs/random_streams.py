@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,9 +65,12 @@ def spread_seeds(seed: int | Sequence[int | None] | None, n: int) -> list[int | 
     """
     if seed is None:
         return [None] * n
+    seeds: list[int | None]
     seeds = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
     if len(seeds) != n:
-        raise ValueError(f"expected one seed for each of {n} copies, got {len(seeds)}; pass one int or {n} seeds")
+        raise ValueError(
+            f"expected one seed for each of {n} copies, got {len(seeds)}; pass one int or {n} seeds"
+        )
     for value in seeds:
         if value is not None and (not isinstance(value, int | np.integer) or value < 0):
             raise ValueError(f"expected seeds that are integers of at least 0, got {value!r}")
@@ -131,8 +135,10 @@ class RandomStreams:
     def _draw(self, rows: NDArray[np.intp] | slice, size: int) -> NDArray[np.float64]:
         blocks = (size + 1) // 2
         drawn = self._drawn[rows]
-        index = drawn[:, None] + np.arange(blocks, dtype=np.uint64)
-        counter = np.stack([index & _LOW, index >> _32, np.full_like(index, self._stream), np.zeros_like(index)])
+        index: Any = drawn[:, None] + np.arange(blocks, dtype=np.uint64)
+        counter = np.stack(
+            [index & _LOW, index >> _32, np.full_like(index, self._stream), np.zeros_like(index)]
+        )
         w0, w1, w2, w3 = philox_4x32(counter, self._key[:, rows][:, :, None])
         self._drawn[rows] = drawn + np.uint64(blocks)
         doubles = np.stack([_to_unit(w0, w1), _to_unit(w2, w3)], axis=-1)

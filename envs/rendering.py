@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ class Canvas:
             return
         angles = np.linspace(0.0, turn * 1.5 * np.pi, 48)
         arc = [(center[0] + radius * np.sin(a), center[1] + radius * np.cos(a)) for a in angles]
-        for start, end in zip(arc[:-1], arc[1:], strict=True):
+        for start, end in pairwise(arc):
             self.rod(start, end, 0.12 * radius, color)
         tangent = np.sign(turn) * np.array([np.cos(angles[-1]), -np.sin(angles[-1])])
         tip = np.asarray(arc[-1]) + 0.42 * radius * tangent
@@ -165,7 +166,14 @@ def _panel(
     values = np.asarray(system.observe(state))
     for name, value in zip(system.observation_names, values, strict=True):
         visible = name in shown
-        _text(surface, f"{value:.2f}" if visible else "hidden", PANEL - 70, y + 4, 17, "text" if visible else "faint")
+        _text(
+            surface,
+            f"{value:.2f}" if visible else "hidden",
+            PANEL - 70,
+            y + 4,
+            17,
+            "text" if visible else "faint",
+        )
         y = _text(surface, name.replace("_", " "), 16, y + 4, 17, "text" if visible else "faint")
     y = _text(surface, "action", 16, y + 16, 15, "faint")
     for i, name in enumerate(system.action_names):

@@ -64,7 +64,9 @@ class Simulation:
             self._streams = RandomStreams(fresh_seeds(len(self)))
         if seeds is not None:
             self._streams.reseed(seeds)
-        drawn = self.system.initial_state(self._streams, mask) if state is None else self._checked_state(state)
+        drawn = (
+            self.system.initial_state(self._streams, mask) if state is None else self._checked_state(state)
+        )
         if mask is None:
             self.state = drawn.copy()
             self.steps[:] = 0
@@ -157,5 +159,7 @@ def start_state(options: dict[str, Any] | None, name: str) -> Any:
         return None
     unknown = set(options) - {"state", "reset_mask"}
     if unknown:
-        raise ValueError(f"{name}: unknown reset option {sorted(unknown)[0]!r}; known: 'state' (and 'reset_mask')")
+        raise ValueError(
+            f"{name}: unknown reset option {sorted(unknown)[0]!r}; known: 'state' (and 'reset_mask')"
+        )
     return options.get("state")

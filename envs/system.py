@@ -119,7 +119,9 @@ class System(ABC):
         """Reward of a transition; the action is clipped to its limits already. Shape (...)."""
 
     @abstractmethod
-    def initial_state(self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    def initial_state(
+        self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float64]:
         """Start states drawn from the start distribution, (n, n_state); only rows of the mask are drawn."""
 
     def terminated(self, state: Array) -> Array:
@@ -190,4 +192,5 @@ def build_system(system_class: type[System], parameters: dict[str, Any]) -> Syst
                 + (f"; did you mean {near[0]!r}?" if near else "")
                 + f" (its parameters: {', '.join(known)})"
             )
-    return system_class(**{k: tuple(v) if isinstance(v, list) else v for k, v in parameters.items()})
+    arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in parameters.items()}
+    return system_class(**arguments)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -42,7 +42,7 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         ValueError: fewer than one copy, a time limit below 1, an unknown autoreset or render mode.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES[:1], "render_fps": 20}
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES[:1], "render_fps": 20}
 
     def __init__(
         self,
@@ -118,9 +118,13 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         if mask is not None:
             mask = np.asarray(mask)
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-                raise ValueError(f"{name}: expected reset_mask with a bool for each of {self.num_envs} copies, one true")
+                raise ValueError(
+                    f"{name}: expected reset_mask with a bool for each of {self.num_envs} copies, one true"
+                )
             if self._needs_reset and not mask.all():
-                raise ValueError(f"{name}: the first reset must be of all copies, got a reset_mask of {mask.sum()}")
+                raise ValueError(
+                    f"{name}: the first reset must be of all copies, got a reset_mask of {mask.sum()}"
+                )
         seeds = None if seed is None else spread_seeds(seed, self.num_envs)
         if seeds is not None and mask is not None:
             seeds = [s if chosen else None for s, chosen in zip(seeds, mask, strict=True)]
@@ -133,7 +137,9 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
 
     def step(  # type: ignore[override]
         self, actions: Any
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    ) -> tuple[
+        NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
+    ]:
         """Step every copy by one control period; see `gymnasium.vector.VectorEnv.step`.
 
         Raises:
@@ -166,14 +172,22 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         if any_done and self._mode == AutoresetMode.SAME_STEP:
             final_state = simulation.state
             simulation.reset(mask=done)
-            return self._observe(simulation.state), reward, terminated, truncated, self._final_infos(final_state, done)
+            return (
+                self._observe(simulation.state),
+                reward,
+                terminated,
+                truncated,
+                self._final_infos(final_state, done),
+            )
         self._finished, self._any_finished = done, any_done
         return self._observe(simulation.state), reward, terminated, truncated, self._infos()
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
         """One picture (height, width, 3) for each copy."""
         if self.render_mode is None:
-            gym.logger.warn('render() without a render_mode; make the environment with render_mode="rgb_array"')
+            gym.logger.warn(
+                'render() without a render_mode; make the environment with render_mode="rgb_array"'
+            )
             return None
         from beliefgym.envs.rendering import picture
 

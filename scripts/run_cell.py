@@ -33,7 +33,9 @@ def run_cell(cell_data: Mapping[str, Any], report: Callable[[dict[str, Any]], No
     curve: list[dict[str, float]] = []
     started = time.perf_counter()
     if cell.total_timesteps:
-        callback = LearningCurve(agent, task, cell.total_timesteps, cell.curve_points, cell.curve_episodes, report)
+        callback = LearningCurve(
+            agent, task, cell.total_timesteps, cell.curve_points, cell.curve_episodes, report
+        )
         callback.evaluate(0)
         agent.learn(cell.total_timesteps, callback=callback)
         callback.evaluate(cell.total_timesteps)
@@ -51,7 +53,11 @@ def run_cell(cell_data: Mapping[str, Any], report: Callable[[dict[str, Any]], No
         "random_score": scale.random,
         "expert_score": scale.expert,
         "learning_curve": curve,
-        "training": {"steps": cell.total_timesteps, "wall_time_s": training_time, "threads": torch.get_num_threads()},
+        "training": {
+            "steps": cell.total_timesteps,
+            "wall_time_s": training_time,
+            "threads": torch.get_num_threads(),
+        },
         "evaluation": {"episodes": cell.eval_episodes, "wall_time_s": time.perf_counter() - started},
         "spec": spec,
         "versions": versions(),

@@ -104,7 +104,9 @@ def git_commit() -> str | None:
     commit = git("rev-parse", "HEAD")
     if commit is None:
         return None
-    return commit + ("+" if git("status", "--porcelain", "--untracked-files=no", "--", "..", ":!../results") else "")
+    return commit + (
+        "+" if git("status", "--porcelain", "--untracked-files=no", "--", "..", ":!../results") else ""
+    )
 
 
 def machine() -> dict[str, Any]:

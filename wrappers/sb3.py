@@ -57,7 +57,7 @@ class SB3VecEnv(VecEnv):
         """Start every episode; seeds given to `seed` and options to `set_options` are used once."""
         seed = list(self._seeds) if any(s is not None for s in self._seeds) else None
         options = self._options[0] if self._options and self._options[0] else None
-        observations, infos = self.env.reset(seed=seed, options=options)
+        observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self.reset_infos = [_row(infos, i) for i in range(self.num_envs)] if infos else self._empty_infos()
         self._reset_seeds()
         self._reset_options()
@@ -76,7 +76,7 @@ class SB3VecEnv(VecEnv):
         self._lengths += 1
         dones = terminated | truncated
         rows = self._empty_infos()
-        if len(infos) > 2 or infos and "final_obs" not in infos:
+        if set(infos) - _FINAL:
             rows = [_row(infos, i) for i in range(self.num_envs)]
         if dones.any():
             elapsed = round(time.time() - self._start, 6)
@@ -85,7 +85,11 @@ class SB3VecEnv(VecEnv):
                 rows[i] |= {
                     "terminal_observation": final[i],
                     "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {"r": round(float(self._returns[i]), 6), "l": int(self._lengths[i]), "t": elapsed},
+                    "episode": {
+                        "r": round(float(self._returns[i]), 6),
+                        "l": int(self._lengths[i]),
+                        "t": elapsed,
+                    },
                 }
             self._returns[dones] = 0.0
             self._lengths[dones] = 0
@@ -97,7 +101,11 @@ class SB3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute for each copy: the batch's own, split where it has one row a copy."""
-        value = getattr(self.env.unwrapped, attr_name) if not hasattr(self.env, attr_name) else getattr(self.env, attr_name)
+        value = (
+            getattr(self.env.unwrapped, attr_name)
+            if not hasattr(self.env, attr_name)
+            else getattr(self.env, attr_name)
+        )
         chosen = list(self._get_indices(indices))
         if isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,):
             return [value[i] for i in chosen]
@@ -110,10 +118,14 @@ class SB3VecEnv(VecEnv):
             ValueError: for some copies only; they are one object.
         """
         if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"cannot set {attr_name!r} for some copies only: all copies are one vector environment")
+            raise ValueError(
+                f"cannot set {attr_name!r} for some copies only: all copies are one vector environment"
+            )
         setattr(self.env.unwrapped, attr_name, value)
 
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
         """Call a method of the batch once; its answer is repeated for each copy asked for."""
         target = self.env if hasattr(self.env, method_name) else self.env.unwrapped
         answer = getattr(target, method_name)(*args, **kwargs)
@@ -131,13 +143,17 @@ class SB3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """A picture of each copy."""
-        return list(self.env.render() or [None] * self.num_envs)
+        pictures: Any = self.env.render()
+        return list(pictures) if pictures is not None else [None] * self.num_envs
 
     def _empty_infos(self) -> list[dict[str, Any]]:
         return [{} for _ in range(self.num_envs)]
 
     def _get_indices(self, indices: VecEnvIndices) -> Iterable[int]:
         return super()._get_indices(indices)
+
+
+_FINAL = {"final_obs", "_final_obs", "final_info", "_final_info"}
 
 
 def _row(infos: dict[str, Any], i: int) -> dict[str, Any]:

@@ -38,7 +38,9 @@ class Task:
     wrappers: tuple[tuple[str, Mapping[str, Any]], ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "wrappers", tuple((name, dict(arguments)) for name, arguments in self.wrappers))
+        object.__setattr__(
+            self, "wrappers", tuple((name, dict(arguments)) for name, arguments in self.wrappers)
+        )
         object.__setattr__(self, "kwargs", dict(self.kwargs))
         for name, _ in self.wrappers:
             if name not in NAMES:
@@ -76,7 +78,8 @@ class Task:
             )
         else:
             env = SyncVectorEnv(
-                [lambda: gym.make(self.env_id, **self.kwargs) for _ in range(num_envs)], autoreset_mode=autoreset_mode
+                [lambda: gym.make(self.env_id, **self.kwargs) for _ in range(num_envs)],
+                autoreset_mode=autoreset_mode,
             )
         for name, arguments in self.wrappers:
             env = getattr(vector_wrappers, name)(env, **arguments)
@@ -92,7 +95,9 @@ class Task:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Task:
         """The task of `to_dict`."""
-        return cls(data["env_id"], data["kwargs"], tuple((name, arguments) for name, arguments in data["wrappers"]))
+        return cls(
+            data["env_id"], data["kwargs"], tuple((name, arguments) for name, arguments in data["wrappers"])
+        )
 
 
 def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:

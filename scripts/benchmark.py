@@ -1,0 +1,113 @@
+"""`beliefgym benchmark NAME`: speed as ratios, ours and a rival side by side in one run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from beliefgym.scripts.training import git_commit, machine, versions
+
+BENCHMARKS = {"env": "beliefgym.scripts.benchmarks.env:run"}
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Measure speed against what a user would pick instead; leave the machine alone meanwhile.
+
+    Examples:
+        beliefgym benchmark env
+    """
+
+    name: tyro.conf.Positional[str]
+    """Which: env."""
+    results: Path = Path("results")
+    """Folder; NAME.json and NAME.md are written to its benchmark/."""
+
+    def run(self) -> int:
+        """Measure, write, print; 0 even where a target is missed: the table says so."""
+        if self.name not in BENCHMARKS:
+            near = get_close_matches(self.name, BENCHMARKS, n=1)
+            raise ValueError(
+                f"there is no benchmark {self.name!r}"
+                + (f"; did you mean {near[0]!r}?" if near else "")
+                + f" (known: {', '.join(BENCHMARKS)})"
+            )
+        folder = self.results / "benchmark"
+        folder.mkdir(parents=True, exist_ok=True)
+        module, _, function = BENCHMARKS[self.name].partition(":")
+        console = Console()
+        with console.status("measuring") as status:
+            rows, limits = getattr(import_module(module), function)(
+                lambda text: status.update(f"measuring {text}")
+            )
+        record = {
+            "command": f"beliefgym benchmark {self.name}",
+            "versions": versions(),
+            "git_commit": git_commit(),
+            "machine": machine(),
+            "limits": limits,
+            "rows": rows,
+        }
+        path = folder / f"{self.name}.json"
+        path.write_text(json.dumps(record, indent=1) + "\n")
+        path.with_suffix(".md").write_text(markdown(record))
+        console.print(table(rows))
+        for name, limit in limits.items():
+            console.print(f"{name}: {limit}")
+        console.print(f"written: {path}, {path.with_suffix('.md')}")
+        return 0
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    meets = {None: "", True: "yes", False: "no"}[row["meets"]]
+    target = "" if row["target"] is None else f"{row['target']:g}"
+    return [
+        row["what"],
+        f"{row['ours']['value']:,.0f}",
+        row["rival_name"],
+        f"{row['rival']['value']:,.0f}",
+        f"{row['ratio']:.2f}",
+        target,
+        meets,
+    ]
+
+
+HEADER = ("what", "ours", "rival", "rival's", "ratio", "target", "meets")
+
+
+def table(rows: list[dict[str, Any]]) -> Table:
+    """The rows for a terminal."""
+    shown = Table()
+    for name in HEADER:
+        shown.add_column(name, justify="left" if name in ("what", "rival") else "right")
+    for one in rows:
+        shown.add_row(*_cells(one))
+    return shown
+
+
+def markdown(record: dict[str, Any]) -> str:
+    """The record as a Markdown page."""
+    lines = [f"# {record['command']}", "", f"Machine: {record['machine']}", ""]
+    lines += ["| " + " | ".join(HEADER) + " |", "|---|---:|---|---:|---:|---:|---|"]
+    lines += ["| " + " | ".join(_cells(one)) + " |" for one in record["rows"]]
+    lines += [
+        "",
+        "Medians of interleaved repeats; their ranges stand in the JSON file. Limits measured beside:",
+        "",
+    ]
+    lines += [f"- {name}: {_plain(limit)}" for name, limit in record["limits"].items()]
+    return "\n".join(lines) + "\n"
+
+
+def _plain(limit: Any) -> str:
+    if not isinstance(limit, dict):
+        return str(limit)
+    return ", ".join(f"{name} {value:,.3g}" for name, value in limit.items())

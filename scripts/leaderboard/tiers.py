@@ -1,0 +1,94 @@
+"""The tiers of the leaderboard: which tasks, agents, seeds and budgets.
+
+On-policy and off-policy algorithms use an environment step so differently that one budget for both would be unfair
+to one of them: each family has its own, the same for every member, and it stands in the table. The options of every
+agent (its hyperparameters too) are written into the cells, so that a change of them is a change of configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from beliefgym.agents import find_agent
+from beliefgym.scripts.leaderboard.errors import LeaderboardError
+from beliefgym.scripts.leaderboard.grid import AgentVariant, Cell, Grid, product
+from beliefgym.wrappers.task import Task
+
+POSITION_ONLY = ("beliefgym/PendulumPosition-v0", "beliefgym/CartPoleSwingUpPosition-v0")
+REFERENCES = {"random": 0, "expert": 0}
+RUNNER = "beliefgym.scripts.run_cell:run_cell"
+
+TIERS: dict[str, dict[str, Any]] = {
+    "smoke": {
+        "description": "One short run of one agent: does everything work?",
+        "tasks": POSITION_ONLY[:1],
+        "steps": {"random": 0, "ppo": 8192},
+        "seeds": 1,
+        "eval_episodes": 20,
+        "time_limit_s": 300,
+    },
+    "standard": {
+        "description": "Two position-only tasks and the agents that learn within a quarter of an hour, two seeds.",
+        "tasks": POSITION_ONLY,
+        "steps": {**REFERENCES, "sac-stack": 10_000, "sac": 10_000, "ppo-stack": 100_000, "ppo": 100_000},
+        "seeds": 2,
+        "eval_episodes": 100,
+        "time_limit_s": 600,
+    },
+    "full": {
+        "description": "Two position-only tasks and every agent, three seeds.",
+        "tasks": POSITION_ONLY,
+        "steps": {
+            **REFERENCES,
+            "recurrent-ppo": 100_000,
+            "sac-stack": 30_000,
+            "sac": 30_000,
+            "ppo-stack": 100_000,
+            "ppo": 100_000,
+        },
+        "seeds": 3,
+        "eval_episodes": 300,
+        "time_limit_s": 3600,
+    },
+}
+
+
+def tier(name: str) -> Grid:
+    """The grid of a tier.
+
+    Raises:
+        LeaderboardError: an unknown tier.
+    """
+    if name not in TIERS:
+        raise LeaderboardError(f"there is no tier {name!r} (known: {', '.join(TIERS)})")
+    plan = TIERS[name]
+    cells = build_cells(
+        [Task(env_id) for env_id in plan["tasks"]], plan["steps"], range(plan["seeds"]), plan["eval_episodes"]
+    )
+    return Grid(name, cells, time_limit_s=plan["time_limit_s"], description=plan["description"])
+
+
+def build_cells(
+    tasks: Sequence[Task], steps: Mapping[str, int], seeds: Sequence[int], eval_episodes: int
+) -> tuple[Cell, ...]:
+    """The cells of tasks x agents x seeds, every agent with the options registered for the task.
+
+    Args:
+        tasks: the tasks.
+        steps: agent -> training steps.
+        seeds: seeds of the training.
+        eval_episodes: test episodes of each cell.
+
+    Returns:
+        the cells, seeds outermost.
+    """
+    cells: list[Cell] = []
+    for seed in seeds:
+        for task in tasks:
+            variants = [
+                AgentVariant(agent, find_agent(agent).options(task.env_id), total_timesteps=budget)
+                for agent, budget in steps.items()
+            ]
+            cells += product([task], variants, [seed], total_timesteps=0, eval_episodes=eval_episodes)
+    return tuple(cells)

@@ -1,0 +1,5 @@
+"""`python -m beliefgym`."""
+
+from beliefgym.scripts.cli import main
+
+main()
