@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from beliefgym.envs.observation import Observer
+from beliefgym.envs.observation import Shown
 from beliefgym.envs.random_streams import spread_seeds
 from beliefgym.envs.simulation import Simulation, start_state
 from beliefgym.envs.system import System, build_system
@@ -53,7 +53,7 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         **parameters: the system's parameters by name; an unknown one is an error.
     """
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 20}
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 20}  # noqa: RUF012 (as in gym.Env)
 
     def __init__(
         self,
@@ -68,11 +68,11 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.system = load_system(system, parameters)
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.system.dt))}
         self.render_mode = render_mode
-        self._observe = Observer(self.system, components)
-        self.observation_space: Box = self._observe.space  # type: ignore[assignment]
-        self.action_space = action_space(self.system)
+        self._shown = Shown(self.system, components)
+        self.observation_space: Any = self._shown.space
+        self.action_space: Any = action_space(self.system)
         self._hint = hint
-        self._simulation = Simulation(self.system, 1, type(self.system).__name__)
+        self._simulation = Simulation(self.system, 1, type(self.system).__name__, self._shown.columns)
         self._last_action: NDArray[np.float64] | None = None
         self._window: Any = None
         self._needs_reset = True
@@ -85,7 +85,7 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the components that are shown."""
-        return self._observe.names
+        return self._shown.names
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._needs_reset = False
         if self.render_mode == "human":
             self.render()
-        return self._observe(self._simulation.state)[0], self._info()
+        return self._simulation.observe()[0], self._info()
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One control period; see `gymnasium.Env.step`.
@@ -115,12 +115,12 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         simulation = self._simulation
         if self._needs_reset:
             raise gym.error.ResetNeeded(f"{simulation.name}: step before reset; call reset() first")
-        checked = simulation.checked_action(action, (self.system.n_action,))
-        reward, terminated = simulation.step(checked)
-        self._last_action = self.system.clip(checked[0])
+        action = simulation.shaped_action(action, (self.system.n_action,))
+        reward, terminated, _, _ = simulation.step(action)
+        self._last_action = action[0]
         if self.render_mode == "human":
             self.render()
-        return self._observe(simulation.state)[0], float(reward[0]), bool(terminated[0]), False, self._info()
+        return simulation.observe()[0], float(reward[0]), bool(terminated[0]), False, self._info()
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The picture (height, width, 3) in mode "rgb_array"; shown in a window in mode "human"."""
@@ -131,7 +131,8 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             return None
         from beliefgym.envs.rendering import Window, picture
 
-        frame = picture(self.system, self._simulation.state[0], self._last_action, self.observation_names)
+        action = None if self._last_action is None else self.system.clip(self._last_action)
+        frame = picture(self.system, self._simulation.state[0], action, self.observation_names)
         if self.render_mode == "rgb_array":
             return frame
         if self._window is None:

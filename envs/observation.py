@@ -1,4 +1,4 @@
-"""What an environment shows of a state: the named components it keeps, as float32, and their space."""
+"""What an environment shows of a state: the named components that it keeps, and their space."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from difflib import get_close_matches
 
 import numpy as np
 from gymnasium.spaces import Box
-from numpy.typing import NDArray
 
 from beliefgym.envs.system import System
 
 
-class Observer:
+class Shown:
     """The kept components of a system's full observation.
+
+    Attributes:
+        names: of the components. columns: their places in the full observation. space: a float32 box.
 
     Args:
         system: the system.
@@ -36,18 +38,7 @@ class Observer:
                     + (f"; did you mean {near[0]!r}?" if near else "")
                     + f" (it has {', '.join(available)})"
                 )
-        index = [available.index(name) for name in self.names]
-        prefix = index == list(range(len(index)))
-        self._system = system
-        self._columns: slice | list[int] | None = None
-        if (components is not None and len(index) < len(available)) or not prefix:
-            self._columns = slice(0, len(index)) if prefix else index
+        self.columns = tuple(available.index(name) for name in self.names)
         low, high = system.observation_limits
+        index = list(self.columns)
         self.space = Box(low[index].astype(np.float32), high[index].astype(np.float32), dtype=np.float32)
-
-    def __call__(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(..., n_state) -> (..., n_kept), float32, in an array of its own."""
-        full = self._system.observe(state)
-        if self._columns is not None:
-            full = full[..., self._columns]
-        return full.astype(np.float32)

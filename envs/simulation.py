@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefgym.envs.kernel import NAN_ACTION, NO_LIMIT, NOT_FINITE, TERMINATED, TRUNCATED, make_kernel
 from beliefgym.envs.random_streams import RandomStreams, fresh_seeds
 from beliefgym.envs.system import System
 
@@ -31,18 +32,35 @@ class Simulation:
         system: the system.
         n: number of copies.
         name: what error messages call it (the environment id).
+        columns: which components of the system's observation to show; all by default.
+        max_steps: steps after which an episode is truncated; None for no limit.
     """
 
-    def __init__(self, system: System, n: int, name: str) -> None:
+    def __init__(
+        self,
+        system: System,
+        n: int,
+        name: str,
+        columns: Sequence[int] | None = None,
+        max_steps: int | None = None,
+    ) -> None:
         self.system = system
         self.name = name
+        self.kernel = make_kernel(
+            system, range(len(system.observation_names)) if columns is None else columns
+        )
         self.state: NDArray[np.float64] = np.zeros((n, system.n_state))
         self.steps = np.zeros(n, dtype=np.int64)
+        self._limit = NO_LIMIT if max_steps is None else max_steps
         self._streams: RandomStreams | None = None
         self._noise_size = system.noise_size
 
     def __len__(self) -> int:
         return len(self.steps)
+
+    def observe(self) -> NDArray[np.float32]:
+        """(n, n_shown) what is shown of the states, in an array of its own."""
+        return self.kernel.observe(self.state)
 
     def reset(
         self,
@@ -67,8 +85,8 @@ class Simulation:
         drawn = (
             self.system.initial_state(self._streams, mask) if state is None else self._checked_state(state)
         )
-        if mask is None:
-            self.state = drawn.copy()
+        if mask is None or mask.all():
+            self.state = np.array(drawn)
             self.steps[:] = 0
         else:
             self.state = np.where(mask[:, None], drawn, self.state)
@@ -76,41 +94,51 @@ class Simulation:
 
     def step(
         self, action: NDArray[np.float64], active: NDArray[np.bool_] | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], bool]:
         """Step every copy (or the active ones) by one control period.
 
         Args:
-            action: (n, n_action), checked by `checked_action`.
+            action: (n, n_action), of the shape that `shaped_action` has checked.
             active: (n,) the copies that move; the others keep their state and draw no noise.
 
         Returns:
-            reward (n,), terminated (n,).
+            reward (n,), terminated (n,), truncated (n,), and whether any copy is one of the two.
 
         Raises:
+            ValueError: NaN in an action; names the copy, the component and the step.
             NonFiniteError: a state became NaN or infinite; names the copy, the component and the step.
         """
-        system, state = self.system, self.state
-        action = system.clip(action)
+        state, n = self.state, len(self.steps)
         noise = None
         if self._noise_size:
             if self._streams is None:
                 raise RuntimeError(f"{self.name}: step before reset; call reset() first")
             noise = self._streams.normal(self._noise_size, active)
-        next_state = system.step(state, action, noise)
+        next_state = np.empty_like(state)
+        reward = np.empty(n)
+        terminated = np.empty(n, dtype=np.bool_)
+        truncated = np.empty(n, dtype=np.bool_)
+        flags = self.kernel.step(
+            state, action, noise, self.steps, self._limit, next_state, reward, terminated, truncated
+        )
         if active is not None:
-            next_state = np.where(active[:, None], next_state, state)
-        if not np.isfinite(next_state.sum()):
-            self._tell_non_finite(next_state, action)
-        reward = system.reward(state, action, next_state)
+            still = ~active
+            self.steps[still] -= 1
+            next_state[still] = state[still]
+            reward[still] = 0.0
+            terminated[still] = truncated[still] = False
+        if flags & (NAN_ACTION | NOT_FINITE):
+            self.steps -= 1 if active is None else active
+            self._tell_what_is_wrong(next_state, action)
+            self.steps += 1 if active is None else active
         self.state = next_state
-        self.steps += 1 if active is None else active
-        return reward, system.terminated(next_state)
+        return reward, terminated, truncated, bool(flags & (TERMINATED | TRUNCATED))
 
-    def checked_action(self, action: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """The action as (n, n_action) float64.
+    def shaped_action(self, action: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """The action as (n, n_action) float64; infinite numbers are clipped to the limits by the system.
 
         Raises:
-            ValueError: another shape, or NaN; infinite numbers are clipped to the limits by the system.
+            ValueError: another shape.
         """
         array = np.asarray(action, dtype=np.float64)
         if array.shape != shape:
@@ -118,13 +146,7 @@ class Simulation:
                 f"{self.name}: expected an action of shape {shape} ({', '.join(self.system.action_names)}), "
                 f"got shape {array.shape}"
             )
-        if np.isnan(array.sum()) and np.isnan(array).any():
-            copy, component = np.argwhere(np.isnan(array.reshape(len(self), -1)))[0]
-            raise ValueError(
-                f"{self.name}: action {self.system.action_names[component]!r} of copy {copy} is NaN at step "
-                f"{self.steps[copy]} of its episode; look at what produced it (a diverged policy, a 0/0)"
-            )
-        return array.reshape(len(self), -1)
+        return array.reshape(len(self.steps), -1)
 
     def _checked_state(self, state: Any) -> NDArray[np.float64]:
         array = np.asarray(state, dtype=np.float64)
@@ -137,16 +159,19 @@ class Simulation:
             raise ValueError(f"{self.name}: expected a finite start state, got {array.tolist()}")
         return np.broadcast_to(array, self.state.shape)
 
-    def _tell_non_finite(self, state: NDArray[np.float64], action: NDArray[np.float64]) -> None:
-        bad = np.argwhere(~np.isfinite(state))
-        if not len(bad):
-            return
-        copy, component = bad[0]
-        raise NonFiniteError(
-            f"{self.name}: state {self.system.state_names[component]!r} of copy {copy} became "
-            f"{state[copy, component]} at step {self.steps[copy] + 1} of its episode (state before: "
-            f"{self.state[copy].tolist()}, action: {action[copy].tolist()}); a smaller dt or milder parameters may help"
-        )
+    def _tell_what_is_wrong(self, state: NDArray[np.float64], action: NDArray[np.float64]) -> None:
+        for copy, component in np.argwhere(np.isnan(action)):
+            raise ValueError(
+                f"{self.name}: action {self.system.action_names[component]!r} of copy {copy} is NaN at step "
+                f"{self.steps[copy] + 1} of its episode; look at what produced it (a diverged policy, a 0/0)"
+            )
+        for copy, component in np.argwhere(~np.isfinite(state)):
+            raise NonFiniteError(
+                f"{self.name}: state {self.system.state_names[component]!r} of copy {copy} became "
+                f"{state[copy, component]} at step {self.steps[copy] + 1} of its episode (state before: "
+                f"{self.state[copy].tolist()}, action: {action[copy].tolist()}); a smaller dt or milder "
+                "parameters may help"
+            )
 
 
 def start_state(options: dict[str, Any] | None, name: str) -> Any:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from beliefgym.envs.env import RENDER_MODES, action_space, load_system
-from beliefgym.envs.observation import Observer
+from beliefgym.envs.observation import Shown
 from beliefgym.envs.random_streams import spread_seeds
 from beliefgym.envs.simulation import Simulation, start_state
 from beliefgym.envs.system import System
@@ -42,7 +42,7 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         ValueError: fewer than one copy, a time limit below 1, an unknown autoreset or render mode.
     """
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES[:1], "render_fps": 20}
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES[:1], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -71,13 +71,15 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
             "autoreset_mode": self._mode,
             "render_fps": max(1, round(1.0 / self.system.dt)),
         }
-        self._observe = Observer(self.system, components)
-        self.single_observation_space = self._observe.space
+        self._shown = Shown(self.system, components)
+        self.single_observation_space = self._shown.space
         self.single_action_space = action_space(self.system)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._hint = hint
-        self._simulation = Simulation(self.system, num_envs, type(self.system).__name__)
+        self._simulation = Simulation(
+            self.system, num_envs, type(self.system).__name__, self._shown.columns, max_episode_steps
+        )
         self._finished = np.zeros(num_envs, dtype=np.bool_)
         self._any_finished = False
         self._last_action: NDArray[np.float64] | None = None
@@ -91,7 +93,7 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the components that are shown."""
-        return self._observe.names
+        return self._shown.names
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -133,7 +135,7 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         self._any_finished = bool(self._finished.any())
         self._last_action = None
         self._needs_reset = False
-        return self._observe(self._simulation.state), self._infos()
+        return self._simulation.observe(), self._infos()
 
     def step(  # type: ignore[override]
         self, actions: Any
@@ -150,7 +152,7 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         simulation = self._simulation
         if self._needs_reset:
             raise gym.error.ResetNeeded(f"{simulation.name}: step before reset; call reset() first")
-        actions = simulation.checked_action(actions, (self.num_envs, self.system.n_action))
+        actions = simulation.shaped_action(actions, (self.num_envs, self.system.n_action))
         self._last_action = actions
         restarting = self._finished if self._any_finished else None
         if restarting is not None and self._mode == AutoresetMode.DISABLED:
@@ -158,29 +160,20 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
                 f"{simulation.name}: copy {int(np.argmax(restarting))} has finished; "
                 'call reset(options={"reset_mask": ...}) for it'
             )
-        reward, terminated = simulation.step(actions, None if restarting is None else ~restarting)
+        active = None if restarting is None else ~restarting
+        reward, terminated, truncated, any_done = simulation.step(actions, active)
         if restarting is not None:
             simulation.reset(mask=restarting)
-            reward = np.where(restarting, 0.0, reward)
-            terminated = terminated & ~restarting
-        if self.max_episode_steps is None:
-            truncated = np.zeros(self.num_envs, dtype=np.bool_)
-        else:
-            truncated = simulation.steps >= self.max_episode_steps
+        if not any_done:
+            self._any_finished = False
+            return simulation.observe(), reward, terminated, truncated, self._infos()
         done = terminated | truncated
-        any_done = bool(done.any())
-        if any_done and self._mode == AutoresetMode.SAME_STEP:
+        if self._mode == AutoresetMode.SAME_STEP:
             final_state = simulation.state
             simulation.reset(mask=done)
-            return (
-                self._observe(simulation.state),
-                reward,
-                terminated,
-                truncated,
-                self._final_infos(final_state, done),
-            )
-        self._finished, self._any_finished = done, any_done
-        return self._observe(simulation.state), reward, terminated, truncated, self._infos()
+            return simulation.observe(), reward, terminated, truncated, self._final_infos(final_state, done)
+        self._finished, self._any_finished = done, bool(done.any())
+        return simulation.observe(), reward, terminated, truncated, self._infos()
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
         """One picture (height, width, 3) for each copy."""
@@ -205,7 +198,7 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
     def _final_infos(self, final_state: NDArray[np.float64], done: NDArray[np.bool_]) -> dict[str, Any]:
         final_observations = np.full(self.num_envs, None, dtype=object)
         rows = np.flatnonzero(done)
-        for row, observation in zip(rows, self._observe(final_state[rows]), strict=True):
+        for row, observation in zip(rows, self._simulation.kernel.observe(final_state[rows]), strict=True):
             final_observations[row] = observation
         final_info: dict[str, Any] = {"state": final_state, "_state": done}
         if self._hint:

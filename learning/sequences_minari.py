@@ -91,7 +91,7 @@ def to_minari(
     try:
         with warnings.catch_warnings():
             # Minari warns about each of its own metadata that is left None.
-            warnings.filterwarnings("ignore", message=".* is set to None", category=UserWarning)
+            warnings.filterwarnings("ignore", message=".* is (set to )?None", category=UserWarning)
             dataset = minari.create_dataset_from_buffers(
                 dataset_id,
                 buffers,

@@ -82,17 +82,17 @@ def load_npz(path: str | os.PathLike[str]) -> Sequences:
         )
     try:
         header = json.loads(str(held.pop(HEADER)))
-        version, names, metadata = header["version"], header.get("names"), header.get("metadata")
+        if header["version"] > FORMAT_VERSION:
+            raise ValueError(
+                f"{path} has version {header['version']} of the format, and this beliefgym reads up to "
+                f"{FORMAT_VERSION}; update beliefgym"
+            )
+        wanted = dict.fromkeys((*_REQUIRED, *header["arrays"]))
+        names, metadata = dict(header["names"]), header["metadata"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path} is damaged: its header is unreadable ({error!r}); write it again"
         ) from error
-    if version > FORMAT_VERSION:
-        raise ValueError(
-            f"{path} has version {version} of the format, and this beliefgym reads up to {FORMAT_VERSION}; "
-            "update beliefgym"
-        )
-    wanted = dict.fromkeys((*_REQUIRED, *header["arrays"]))
     for name in wanted:
         if name not in held:
             raise ValueError(

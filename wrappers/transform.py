@@ -245,8 +245,8 @@ class VectorTransformObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         last[rows] = np.stack(list(infos["final_obs"][rows]))
         going_on = self.transform.step(last, actions)
         final_observations = np.full(self.num_envs, None, dtype=object)
-        for row in rows:
-            final_observations[row] = going_on[row].copy()
+        for row, observation in zip(rows, going_on[rows], strict=True):
+            final_observations[row] = observation
         begun = self.transform.reset(observations, ended)
         return np.where(ended[:, None], begun, going_on), {**infos, "final_obs": final_observations}
 

@@ -34,6 +34,7 @@ HEAVY_MODULES = (
 )
 TICK_S = 0.5  # longest wait between two looks at deadlines and the display
 GRACE_S = 5.0  # between SIGTERM and SIGKILL, and for a process to end after its result
+START_ATTEMPTS = 3
 LOG_TAIL = 4000  # characters of the last output kept for a failed cell
 
 
@@ -147,13 +148,20 @@ class _Running:
 
     def start(self) -> None:
         """Starts the process and then its clock: the first start waits for the fork server's modules."""
-        try:
-            self.process.start()
-        except (EOFError, ConnectionError) as error:
-            raise LeaderboardError(
-                "the server that starts the cells' processes has ended, most likely while it loaded its "
-                "modules: see its message above, or try `python -c 'import stable_baselines3, beliefgym'`"
-            ) from error
+        for attempt in range(START_ATTEMPTS):
+            try:
+                self.process.start()
+                break
+            except (
+                EOFError,
+                ConnectionError,
+            ) as error:  # the server is dying; a new one starts once it is dead
+                if attempt == START_ATTEMPTS - 1:
+                    raise LeaderboardError(
+                        "the server that starts the cells' processes has ended, most likely while it loaded its "
+                        "modules: see its message above, or try `python -c 'import stable_baselines3, beliefgym'`"
+                    ) from error
+                time.sleep(TICK_S)
         self._started, self._begun = timestamp(), time.monotonic()
         self.deadline = self._begun + self._time_limit_s
         self._theirs.close()

@@ -31,7 +31,7 @@ def numbers(sequences):
 def test_split_sizes(sizes, counts):
     parts = numbered(10).split(sizes, seed=3)
     assert [len(part) for part in parts] == counts
-    assert sorted(sum((numbers(part) for part in parts), [])) == list(range(10))
+    assert sorted(n for part in parts for n in numbers(part)) == list(range(10))
     assert all(numbers(part) == sorted(numbers(part)) for part in parts)
 
 
@@ -69,7 +69,7 @@ def test_bad_splits(sizes, message):
 def test_folds_test_every_episode_once():
     folds = list(numbered(11).folds(3, seed=0))
     assert sorted(len(test) for _, test in folds) == [3, 4, 4]
-    assert sorted(sum((numbers(test) for _, test in folds), [])) == list(range(11))
+    assert sorted(n for _, test in folds for n in numbers(test)) == list(range(11))
     for train, test in folds:
         assert sorted(numbers(train) + numbers(test)) == list(range(11))
     assert numbers(folds[0][1]) != [0, 1, 2, 3]

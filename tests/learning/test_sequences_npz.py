@@ -149,6 +149,9 @@ def test_a_later_version_and_a_broken_header(sequences, tmp_path):
         ValueError, match="has version 99 of the format, and this beliefgym reads up to 1; update"
     ):
         load_npz(path)
+    resave(path, beliefgym_sequences=np.array('{"version": 1}'))
+    with pytest.raises(ValueError, match=r"its header is unreadable \(KeyError\('arrays'\)\)"):
+        load_npz(path)
     resave(path, beliefgym_sequences=np.array("{"))
     with pytest.raises(ValueError, match="is damaged: its header is unreadable"):
         load_npz(path)
@@ -158,5 +161,5 @@ def test_the_content_is_checked_again(sequences, tmp_path):
     path = tmp_path / "run.npz"
     sequences.save_npz(path)
     resave(path, rewards=np.full((3, 5), np.nan))
-    with pytest.raises(ValueError, match="rewards: expected finite numbers.* got nan at episode 0, step 0"):
+    with pytest.raises(ValueError, match=r"rewards: expected finite numbers.* got nan at episode 0, step 0"):
         load_npz(path)

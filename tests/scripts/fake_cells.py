@@ -16,7 +16,11 @@ from beliefgym.scripts.leaderboard import AgentVariant, Grid, product
 
 RANDOM, EXPERT = -1200.0, -140.0
 LEVEL = {"random": 0.0, "weak": 0.3, "strong": 0.9}
-LIGHT = ("beliefgym.scripts.leaderboard.cell_process", "fake_cells", "pytest")  # a fork server that starts soon
+LIGHT = (
+    "beliefgym.scripts.leaderboard.cell_process",
+    "fake_cells",
+    "pytest",
+)  # a fork server that starts soon
 
 
 class FakeTask:
@@ -56,7 +60,11 @@ def result_of(cell: Mapping[str, Any]) -> dict[str, Any]:
         "random_score": RANDOM,
         "expert_score": EXPERT,
         "learning_curve": [
-            {"step": steps * k // 5, "mean_return": float(RANDOM + level * k / 5 * (EXPERT - RANDOM)), "std": 9.0}
+            {
+                "step": steps * k // 5,
+                "mean_return": float(RANDOM + level * k / 5 * (EXPERT - RANDOM)),
+                "std": 9.0,
+            }
             for k in range(6)
         ],
         "training": {"steps": steps, "wall_time_s": 0.5},
@@ -190,5 +198,3 @@ def main() -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
-
-

@@ -10,7 +10,11 @@ from beliefgym.scripts.leaderboard.errors import NotPlainJSONError
 from beliefgym.scripts.leaderboard.grid import AgentVariant, Cell, Grid, plain_json, product, slug
 
 CELL = Cell(
-    task={"env_id": "beliefgym/PendulumPosition-v0", "kwargs": {"g": 10.0}, "wrappers": [("Delay", {"steps": 2})]},
+    task={
+        "env_id": "beliefgym/PendulumPosition-v0",
+        "kwargs": {"g": 10.0},
+        "wrappers": [("Delay", {"steps": 2})],
+    },
     task_label="PendulumPosition-v0",
     agent="sac-stack",
     agent_options={"policy": {"net_arch": (64, 64)}},
@@ -52,7 +56,11 @@ def test_whatever_decides_the_result_changes_the_hash(change: dict) -> None:
 
 
 def test_labels_and_the_order_of_options_do_not_change_the_hash() -> None:
-    task = {"wrappers": [["Delay", {"steps": 2}]], "kwargs": {"g": 10.0}, "env_id": "beliefgym/PendulumPosition-v0"}
+    task = {
+        "wrappers": [["Delay", {"steps": 2}]],
+        "kwargs": {"g": 10.0},
+        "env_id": "beliefgym/PendulumPosition-v0",
+    }
     other = dataclasses.replace(CELL, task=task, task_label="another", agent_label="another")
     assert other.config_hash == CELL.config_hash
 
@@ -70,7 +78,10 @@ def test_the_hash_is_the_same_on_every_machine_and_day() -> None:
         ({"total_timesteps": 1e4}, "total_timesteps of a cell is a whole number"),
         ({"task_label": " / "}, "a label needs at least one letter or digit"),
         ({"agent_options": {"lr": float("inf")}}, r"agent_options\.lr is inf, not a finite number"),
-        ({"agent_options": {"net": [1, object()]}}, r"agent_options\.net\[1\] is a builtins\.object, which is not"),
+        (
+            {"agent_options": {"net": [1, object()]}},
+            r"agent_options\.net\[1\] is a builtins\.object, which is not",
+        ),
         ({"task": {1: 2}}, "task has the key 1; keys are text"),
     ],
 )
@@ -89,7 +100,11 @@ def test_unknown_and_missing_fields_are_named() -> None:
 def test_product_runs_the_first_seed_of_everything_first() -> None:
     cells = product(
         [FakeTask("a"), FakeTask("b")],
-        ["sac", AgentVariant("random", total_timesteps=0), AgentVariant("sac", {"lr": 1.0}, label="sac-fast")],
+        [
+            "sac",
+            AgentVariant("random", total_timesteps=0),
+            AgentVariant("sac", {"lr": 1.0}, label="sac-fast"),
+        ],
         [7, 8],
         total_timesteps=10,
         eval_episodes=3,
@@ -112,7 +127,9 @@ def test_a_grid_lists_tasks_and_agents_in_order_of_appearance() -> None:
 def test_a_grid_refuses_cells_that_would_share_a_record() -> None:
     # Case alone does not tell files apart on every system.
     cells = (CELL, dataclasses.replace(CELL, agent_label="SAC-stack", total_timesteps=1))
-    with pytest.raises(ValueError, match=r"would share the record PendulumPosition-v0/SAC-stack/seed-0.*agent_label"):
+    with pytest.raises(
+        ValueError, match=r"would share the record PendulumPosition-v0/SAC-stack/seed-0.*agent_label"
+    ):
         Grid("standard", cells, 60.0)
 
 

@@ -152,11 +152,13 @@ def test_a_mask_may_end_an_episode_early(mode: AutoresetMode) -> None:
         if mask.any():
             begun = [e.reset(options={"reset_mask": mask.copy()})[0] for e in (around, within)]
             assert_same(begun[0], begun[1])
+        elif rng.random() < 0.3:  # all of them
+            assert_same(*(e.reset()[0] for e in (around, within)))
 
 
-def test_async_copies() -> None:
+@pytest.mark.parametrize("stack", [STACKS["everything"], STACKS["delay 0"]], ids=["everything", "delay 0"])
+def test_async_copies(stack: Stack) -> None:
     """An AsyncVectorEnv hands out a buffer that it writes into again."""
-    stack = STACKS["everything"]
     fns = [lambda i=i: pendulum(i) for i in range(2)]
     around = stacked(AsyncVectorEnv(fns, copy=False, autoreset_mode=AutoresetMode.SAME_STEP), stack, vector)
     reference = stacked(SyncVectorEnv(fns, autoreset_mode=AutoresetMode.SAME_STEP), stack, vector)
@@ -219,6 +221,18 @@ def test_what_is_given_out_is_not_written_into_again() -> None:
         np.testing.assert_array_equal(kept, copies)
         kept[:] = np.nan
         expected = clean.step(actions)[0]
+
+
+def test_copies_that_are_not_reset_show_again_what_they_showed() -> None:
+    """... even where the caller has written into what he got."""
+    env = SyncVectorEnv([lambda: pendulum(0)] * N, autoreset_mode=AutoresetMode.DISABLED)
+    wrapped = vector.ObservationNoise(env, 1.0)
+    shown = wrapped.reset(seed=0)[0]
+    expected = shown.copy()
+    shown[:] = np.nan
+    begun = wrapped.reset(options={"reset_mask": np.array([False, True, False])})[0]
+    np.testing.assert_array_equal(begun[[0, 2]], expected[[0, 2]])
+    assert not np.array_equal(begun[1], expected[1])
 
 
 def test_infos_of_the_environment_stay_as_they_are() -> None:
