@@ -242,8 +242,8 @@ class _Recorder:
         self._steps.setdefault("rewards", []).append(reward)
 
         started = self._resetting
-        self._length += ~started
-        done = (terminated | truncated) & ~started
+        self._length += 1
+        done = terminated | truncated
         cut = ~done & ~started & (self._length >= self._max_steps) & (self.remaining > 0)
         ended = np.flatnonzero((done | cut) & (self.remaining > 0))
         self._now["observations"] = self._columns(self.observation)
@@ -258,7 +258,7 @@ class _Recorder:
         self._resetting = np.zeros_like(done)
         to_reset = cut
         if copies.mode == AutoresetMode.SAME_STEP:
-            started = started | done
+            started = done
         elif copies.mode == AutoresetMode.NEXT_STEP:
             self._resetting = done
         else:
@@ -322,8 +322,7 @@ class _Recorder:
         """Reset some copies in the middle of the run and let the others be."""
         copies, seeds = self._copies, None
         if copies.mode == AutoresetMode.DISABLED:
-            to_seed = mask & (self.remaining > 0)
-            seeds = [self._seed + int(e) if s else None for e, s in zip(self._episode, to_seed, strict=True)]
+            seeds = [self._seed + int(e) if m else None for e, m in zip(self._episode, mask, strict=True)]
         self.observation, infos = copies.reset(seeds, mask)
         columns = self._columns(self.observation)
         if not np.array_equal(columns[~mask], self._now["observations"][~mask], equal_nan=True):

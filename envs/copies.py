@@ -165,9 +165,9 @@ class VectorCopies(Copies):
         state = getattr(self.env.unwrapped, "state", None)
         if not isinstance(state, np.ndarray) or state.ndim != 2 or len(state) != self.n:
             return None
-        return (
-            None if self.names("state_names", state.shape[1]) is None else np.array(state, dtype=np.float64)
-        )
+        if self.names("state_names", state.shape[1]) is None:
+            return None
+        return np.array(state, dtype=np.float64)
 
 
 def rows_of(infos: dict[str, Any], key: str, rows: NDArray[np.intp]) -> Array | None:

@@ -118,9 +118,6 @@ def test_vector_environment_against_loops(task, mode):
     single = gym.make(task, **kwargs)
     if mode == AutoresetMode.DISABLED:
         expected = loop(single, policy, range(3, 11))
-        assert collect(single, policy, 8, seed=3).equals(
-            Sequences_without_metadata(sequences, single, policy)
-        )
     else:
         copies = [loop(single, policy, [3 + i, None, None]) for i in range(3)]
         expected = [copies[j % 3][j // 3] for j in range(8)]
@@ -323,7 +320,7 @@ def test_states_of_a_foreign_single_environment():
 def test_the_step_limit_truncates(env):
     single = env == "single"
     env = Counting(hint=True) if single else counting([None] * 3, env, hint=True)
-    sequences = collect(env, Remembering(), 12, seed=5, max_steps_per_episode=4)
+    sequences = collect(env, Remembering(), 60, seed=5, max_steps_per_episode=4)
     for length, episode in zip(sequences.lengths, sequences.to_episodes(), strict=True):
         natural = int(episode["observations"][0, 2]) - 1000
         assert length == min(natural, 4)

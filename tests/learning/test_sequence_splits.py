@@ -21,7 +21,7 @@ def numbers(sequences):
         ((0.7, 0.2, 0.1), [7, 2, 1]),
         ((0.5, 0.5), [5, 5]),
         ((0.75, 0.25), [8, 2]),  # 7.5 and 2.5: both remainders equal, the first is rounded up
-        ((0.26, 0.74), [3, 7]),  # 2.6 and 7.4: the larger remainder is rounded up
+        ((0.74, 0.26), [7, 3]),  # 7.4 and 2.6: the larger remainder is rounded up
         ((1.0, 0.0), [10, 0]),
         ((6, 4), [6, 4]),
         ((np.int64(3), 7), [3, 7]),

@@ -177,6 +177,8 @@ def test_a_horizon_longer_than_the_arrays():
     pieces = sequences.segments(5, keep_tail=True)
     assert pieces.observations.shape == (1, 6, 2)
     assert pieces.equals(sequences)
+    assert (pieces.observations[0, 3:] == 0).all()
+    assert (pieces.rewards[0, 2:] == 0).all()
 
 
 def test_bad_segments():
