@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from beliefgym.agents.agent import Agent, episode_starts
 from beliefgym.envs.system import System
+from beliefgym.wrappers import DiscreteActions
 from beliefgym.wrappers.task import Task
 
 
@@ -47,6 +48,7 @@ class Expert(Agent):
         self.system = system
         self._controller = system.expert()
         self._env: Any = None
+        self._table: NDArray[np.float64] | None = None
 
     def learn(self, total_timesteps: int, callback: Any = None, progress_bar: bool = False) -> Self:
         """Nothing to learn."""
@@ -98,8 +100,9 @@ class Expert(Agent):
     def _in_action_space(self, action: NDArray[np.float64], single: bool) -> NDArray[Any]:
         chosen: NDArray[Any] = action.astype(np.float32)
         if not isinstance(self.action_space, gym.spaces.Box):
-            table = _discrete_table(self.task)
-            chosen = np.argmin(np.abs(action[:, None, :] - table[None]).sum(axis=2), axis=1)
+            if self._table is None:
+                self._table = _discrete_table(self.task)
+            chosen = np.argmin(np.abs(action[:, None, :] - self._table).sum(axis=2), axis=1)
         return chosen[0] if single else chosen
 
     def parts(self) -> dict[str, bytes]:
@@ -111,10 +114,12 @@ class Expert(Agent):
 
 
 def _discrete_table(task: Task) -> NDArray[np.float64]:
-    """(bins, n_action) the continuous action behind each discrete one."""
+    """(choices, n_action) the action behind each choice of `DiscreteActions`."""
     env: Any = task.make()
-    while not hasattr(env, "action_table"):
+    while not isinstance(env, DiscreteActions):
         if env is env.unwrapped:
-            raise ValueError(f"the expert cannot act in the action space {task.make().action_space}")
+            raise ValueError(f"the expert cannot act in the action space of {task.label}")
         env = env.env
-    return np.asarray(env.action_table)
+    if not isinstance(env.action_space, gym.spaces.Discrete):
+        raise ValueError(f"the expert acts in Discrete and Box action spaces, got {env.action_space}")
+    return np.stack([env.action(np.int64(i)) for i in range(int(env.action_space.n))])

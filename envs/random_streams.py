@@ -17,7 +17,8 @@ and the key words grow by 0x9E3779B9 and 0xBB67AE85 from round to round.
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -117,32 +118,66 @@ class RandomStreams:
         Returns:
             (n, size).
         """
-        if mask is not None and not mask.all():
-            numbers = np.zeros((len(self), size))
-            rows = np.flatnonzero(mask)
-            numbers[rows] = self._draw(rows, size)
-            return numbers
-        return self._draw(slice(None), size)
+        return self._on_rows(self._uniform, size, mask)
 
     def normal(self, size: int, mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
         """Standard normal numbers by the Box-Muller transform; arguments and shape as `uniform`."""
+        return self._on_rows(self._normal, size, mask)
+
+    def _on_rows(self, draw: Any, size: int, mask: NDArray[np.bool_] | None) -> NDArray[np.float64]:
+        if mask is None or mask.all():
+            numbers: NDArray[np.float64] = draw(np.arange(len(self)), size)
+            return numbers
+        numbers = np.zeros((len(self), size))
+        rows = np.flatnonzero(mask)
+        if len(rows):
+            numbers[rows] = draw(rows, size)
+        return numbers
+
+    def _normal(self, rows: NDArray[np.intp], size: int) -> NDArray[np.float64]:
         pairs = (size + 1) // 2
-        u = self.uniform(2 * pairs, mask)
+        u = self._uniform(rows, 2 * pairs)
         radius = np.sqrt(-2.0 * np.log1p(-u[:, :pairs]))
-        angle = 2.0 * np.pi * u[:, pairs:]
+        angle = (2.0 * np.pi) * u[:, pairs:]
         return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)], axis=1)[:, :size]
 
-    def _draw(self, rows: NDArray[np.intp] | slice, size: int) -> NDArray[np.float64]:
+    def _uniform(self, rows: NDArray[np.intp], size: int) -> NDArray[np.float64]:
         blocks = (size + 1) // 2
-        drawn = self._drawn[rows]
-        index: Any = drawn[:, None] + np.arange(blocks, dtype=np.uint64)
-        counter = np.stack(
-            [index & _LOW, index >> _32, np.full_like(index, self._stream), np.zeros_like(index)]
-        )
-        w0, w1, w2, w3 = philox_4x32(counter, self._key[:, rows][:, :, None])
-        self._drawn[rows] = drawn + np.uint64(blocks)
-        doubles = np.stack([_to_unit(w0, w1), _to_unit(w2, w3)], axis=-1)
-        return doubles.reshape(len(drawn), 2 * blocks)[:, :size]
+        doubles = np.empty((len(rows), 2 * blocks))
+        _filler()(self._key, self._drawn, self._stream, rows, doubles)
+        self._drawn[rows] += np.uint64(blocks)
+        return doubles[:, :size]
+
+
+def fill(
+    key: NDArray[np.uint64],
+    drawn: NDArray[np.uint64],
+    stream: np.uint64,
+    rows: NDArray[np.intp],
+    doubles: NDArray[np.float64],
+) -> None:
+    """Write each row's next uniform doubles, two from a block of four words.
+
+    Args:
+        key: (2, n) of all copies. drawn: (n,) blocks drawn before, not changed here. stream: its number.
+        rows: (k,) the copies that draw.
+        doubles: (k, 2 * blocks), written.
+    """
+    index: Any = drawn[rows][:, None] + np.arange(doubles.shape[1] // 2, dtype=np.uint64)
+    counter = np.stack([index & _LOW, index >> _32, np.full_like(index, stream), np.zeros_like(index)])
+    w0, w1, w2, w3 = philox_4x32(counter, key[:, rows][:, :, None])
+    doubles[:, 0::2] = _to_unit(w0, w1)
+    doubles[:, 1::2] = _to_unit(w2, w3)
+
+
+@cache
+def _filler() -> Callable[..., None]:
+    """`fill`, or the same numbers from a compiled loop where numba is installed."""
+    try:
+        from beliefgym.envs.random_streams_numba import fill as compiled
+    except ImportError:
+        return fill
+    return compiled  # type: ignore[no-any-return]
 
 
 def _to_unit(high: NDArray[np.uint64], low: NDArray[np.uint64]) -> NDArray[np.float64]:

@@ -12,6 +12,9 @@ from beliefgym.wrappers.transform import (
     VectorTransformObservation,
 )
 
+from beliefgym.wrappers.sb3 import SB3VecEnv  # isort: skip
+from beliefgym.wrappers.task import Task  # isort: skip  (it uses the names above)
+
 __all__ = [
     "ActionHistory",
     "DiscreteActions",
@@ -19,6 +22,8 @@ __all__ = [
     "ObservationNoise",
     "ObservationTransform",
     "PartialObservation",
+    "SB3VecEnv",
+    "Task",
     "TransformObservation",
     "VectorTransformObservation",
     "component_names",

@@ -37,7 +37,9 @@ def test_friction_of_the_hinge_takes_its_power():
     state = np.random.default_rng(1).normal(size=(200, 4))
     step = 1e-6
     derivative = system.derivative(state, np.zeros((200, 1)))
-    power = (energy(system, state + step * derivative) - energy(system, state - step * derivative)) / (2 * step)
+    power = (energy(system, state + step * derivative) - energy(system, state - step * derivative)) / (
+        2 * step
+    )
     torque = -system.friction * system.pole_mass * system.length * state[:, 3]
     assert power == pytest.approx(torque * state[:, 3], abs=1e-8)  # central difference of a quadratic at 1e-6
 
@@ -93,7 +95,9 @@ def test_the_reward_is_one_at_rest_upright_and_small_hanging():
     # the factors of the docstring, written out anew
     b = lambda z: np.exp(-np.log(10.0) * z**2)  # noqa: E731
     x, _, theta, w = state.T
-    factors = (1 + np.cos(theta)) / 2 * (1 + b(x / 2)) / 2 * (1 + b(w / 5)) / 2 * (4 + b(action[:, 0] / 10)) / 5
+    factors = (
+        (1 + np.cos(theta)) / 2 * (1 + b(x / 2)) / 2 * (1 + b(w / 5)) / 2 * (4 + b(action[:, 0] / 10)) / 5
+    )
     assert reward == pytest.approx(factors, rel=1e-12)
 
 

@@ -385,7 +385,11 @@ def test_names_come_from_the_outermost_layer_that_has_them():
     class Renamed(gym.Wrapper):
         observation_names = ("a", "b", "c")
 
-    assert collect(Renamed(Counting(2)), None, 1, seed=0).observation_names == ("a", "b", "c")
+    env = Renamed(Counting(2))
+    assert collect(env, None, 1, seed=0).observation_names == ("a", "b", "c")
+    for useless in (("a", "a", "b"), ("a", "b", "c", "c"), "abc", (1, 2, 3)):
+        env.observation_names = useless
+        assert collect(env, None, 1, seed=0).observation_names is None
 
 
 def test_metadata_says_where_the_episodes_come_from():

@@ -33,7 +33,9 @@ def test_spaces_and_time_limit_are_those_of_gymnasiums_pendulum():
     assert ours.spec.max_episode_steps == theirs.spec.max_episode_steps
     starts = np.array([ours.reset(seed=s) and ours.unwrapped.state for s in range(2000)])
     assert (np.abs(starts) <= [np.pi, 1.0]).all()
-    assert np.abs(starts).mean(axis=0) == pytest.approx([np.pi / 2, 0.5], rel=0.05)  # uniform: 2.3 standard errors
+    assert np.abs(starts).mean(axis=0) == pytest.approx(
+        [np.pi / 2, 0.5], rel=0.05
+    )  # uniform: 2.3 standard errors
 
 
 def test_the_position_only_sibling_hides_the_velocity_and_nothing_else():

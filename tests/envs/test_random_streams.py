@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from beliefgym.envs.random_streams import RandomStreams, fresh_seeds, philox_4x32, spread_seeds
+from beliefgym.envs.random_streams import RandomStreams, fill, fresh_seeds, philox_4x32, spread_seeds
 
 # Random123's kat_vectors for philox4x32-10: counter, key, answer
 KNOWN = [
@@ -38,6 +38,20 @@ def test_a_copy_draws_the_same_numbers_alone_and_at_any_place_of_a_batch():
         assert np.array_equal(batch.normal(size)[2], alone.normal(size)[0])
 
 
+def test_the_compiled_loop_draws_the_same_numbers_to_the_last_bit():
+    compiled = pytest.importorskip(
+        "beliefgym.envs.random_streams_numba", reason="numba is not installed"
+    ).fill
+    rng = np.random.default_rng(0)
+    key = rng.integers(0, 2**32, (2, 50), dtype=np.uint64)
+    drawn = rng.integers(0, 2**40, 50, dtype=np.uint64)
+    rows = np.array([3, 49, 7])
+    ours, theirs = np.empty((3, 6)), np.empty((3, 6))
+    fill(key, drawn, np.uint64(9), rows, ours)
+    compiled(key, drawn, np.uint64(9), rows, theirs)
+    assert np.array_equal(ours, theirs)
+
+
 def test_masked_copies_do_not_advance():
     batch = RandomStreams([1, 2])
     batch.uniform(3, np.array([True, False]))
@@ -54,7 +68,9 @@ def test_reseeding_starts_only_the_named_streams_anew():
 
 
 def test_large_seeds_and_stream_numbers_make_different_streams():
-    drawn = [RandomStreams([seed], stream).uniform(1)[0, 0] for seed in (3, 3 + 2**32, 2**63) for stream in (0, 1)]
+    drawn = [
+        RandomStreams([seed], stream).uniform(1)[0, 0] for seed in (3, 3 + 2**32, 2**63) for stream in (0, 1)
+    ]
     assert len(set(drawn)) == len(drawn)
 
 
