@@ -1,6 +1,7 @@
 """Physical systems, their Gymnasium environments and registration."""
 
 from beliefgym.envs.cart_pole import CartPole
+from beliefgym.envs.collect import collect
 from beliefgym.envs.env import SystemEnv
 from beliefgym.envs.pendulum import Pendulum
 from beliefgym.envs.registration import register_all, register_system, registered_ids
@@ -15,6 +16,7 @@ __all__ = [
     "System",
     "SystemEnv",
     "SystemVectorEnv",
+    "collect",
     "register_all",
     "register_system",
     "registered_ids",

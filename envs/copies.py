@@ -87,9 +87,11 @@ class Copies(ABC):
         names = self.declared(field)
         if names is None and field == "state_names" and self.system is not None:
             names = self.system.state_names
-        if not isinstance(names, Sequence) or isinstance(names, str) or len(set(names)) != size:
+        if not isinstance(names, Sequence) or isinstance(names, str):
             return None
-        return tuple(names) if len(names) == size and all(isinstance(name, str) for name in names) else None
+        if not all(isinstance(name, str) for name in names) or not len(names) == len(set(names)) == size:
+            return None
+        return tuple(names)
 
 
 class SingleCopy(Copies):

@@ -91,6 +91,11 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         return self._simulation.state.copy()
 
     @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """When finished copies start anew (TorchRL asks for it by this name, as SyncVectorEnv has it)."""
+        return self._mode
+
+    @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the components that are shown."""
         return self._shown.names

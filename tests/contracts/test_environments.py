@@ -1,0 +1,318 @@
+"""What every registered environment must do: one contract, all ids."""
+
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import stable_baselines3.common.env_checker
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
+
+import beliefgym  # noqa: F401
+from beliefgym.envs import NonFiniteError, registered_ids
+
+IDS = registered_ids()
+NOISY = {"process_noise_std": 0.01, "actuation_noise_std": 0.05}
+every_id = pytest.mark.parametrize("env_id", IDS)
+
+
+def make_vec(env_id, n, mode=AutoresetMode.SAME_STEP, **kwargs):
+    return gym.make_vec(env_id, n, vectorization_mode="vector_entry_point", autoreset_mode=mode.name, **kwargs)
+
+
+def actions_for(env, steps, seed=0):
+    """(steps, n, n_action) within the limits, and a little beyond."""
+    space = env.single_action_space
+    return np.random.default_rng(seed).uniform(
+        1.1 * space.low, 1.1 * space.high, (steps, env.num_envs, *space.shape)
+    )
+
+
+def test_there_are_environments():
+    assert "beliefgym/PendulumPosition-v0" in IDS
+    assert "beliefgym/CartPoleSwingUpPosition-v0" in IDS
+
+
+@every_id
+def test_gymnasiums_checker(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # what it recommends and we decline, for SI units: action boxes other than [-1, 1], unbounded velocities
+        for text in (".*symmetric and normalized", ".*m..imum value is -?infinity", ".*casting to float32"):
+            warnings.filterwarnings("ignore", message=text)
+        check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
+
+
+@every_id
+def test_stable_baselines_checker(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*symmetric and normalized")
+        stable_baselines3.common.env_checker.check_env(gym.make(env_id))
+
+
+@every_id
+def test_torchrl_specs_single_and_vector(env_id):
+    check_env_specs(GymWrapper(gym.make(env_id)))
+    check_env_specs(GymWrapper(make_vec(env_id, 3)))
+
+
+@every_id
+def test_make_by_module_prefix_and_the_spec_rebuilds_it(env_id):
+    env = gym.make(f"beliefgym:{env_id}", process_noise_std=0.01)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.system == env.unwrapped.system
+    assert np.array_equal(again.reset(seed=1)[0], env.reset(seed=1)[0])
+
+
+@every_id
+@pytest.mark.parametrize("kwargs", [{}, NOISY], ids=["exact", "noisy"])
+def test_same_seed_same_trajectory_alone_at_any_position_and_after_pickling(env_id, kwargs):
+    vector = make_vec(env_id, 4, **kwargs)
+    actions = actions_for(vector, 40)
+    first, _ = vector.reset(seed=10)
+    seen = [first, *(vector.step(a)[0] for a in actions)]
+    for copy in range(4):
+        single = gym.make(env_id, **kwargs)
+        trajectory = [single.reset(seed=10 + copy)[0]]
+        for t, a in enumerate(actions[:, copy]):
+            if t == 20:  # in the middle of an episode
+                single = pickle.loads(pickle.dumps(single))
+            observation, _, terminated, truncated, _ = single.step(a)
+            if terminated or truncated:
+                break
+            trajectory.append(observation)
+        assert len(trajectory) > 5
+        for t, observation in enumerate(trajectory):
+            assert np.array_equal(observation, seen[t][copy]), (copy, t)
+    # another place in the batch, another size of the batch
+    other = make_vec(env_id, 2, **kwargs)
+    assert np.array_equal(other.reset(seed=12)[0], first[2:])
+    assert np.array_equal(other.step(actions[0, 2:])[0], seen[1][2:])
+
+
+@every_id
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP], ids=["same", "next"])
+@pytest.mark.parametrize("kwargs", [{}, NOISY], ids=["exact", "noisy"])
+def test_the_native_vector_env_is_gymnasiums_over_single_ones(env_id, mode, kwargs):
+    n, limit = 5, 7
+    native = make_vec(env_id, n, mode, max_episode_steps=limit, **kwargs)
+    rival = SyncVectorEnv(
+        [lambda: gym.make(env_id, max_episode_steps=limit, **kwargs) for _ in range(n)], autoreset_mode=mode
+    )
+    assert native.single_observation_space == rival.single_observation_space
+    assert native.single_action_space == rival.single_action_space
+    assert native.metadata["autoreset_mode"] == mode
+    assert np.array_equal(native.reset(seed=3)[0], rival.reset(seed=3)[0])
+    rng = np.random.default_rng(0)
+    for t, actions in enumerate(actions_for(native, 40)):
+        if t in (3, 25):  # copies out of step with one another
+            mask = rng.random(n) < 0.5
+            mask[0] = True
+            options = {"reset_mask": mask}
+            a, b = native.reset(options=options)[0], rival.reset(options=options)[0]
+            assert np.array_equal(a[mask], b[mask])
+        ours, theirs = native.step(actions), rival.step(actions)
+        for mine, other in zip(ours[:4], theirs[:4], strict=True):
+            assert np.array_equal(mine, other), t
+            assert mine.dtype == other.dtype
+        assert ("final_obs" in ours[4]) == ("final_obs" in theirs[4])
+        if "final_obs" in ours[4]:
+            assert np.array_equal(ours[4]["_final_obs"], theirs[4]["_final_obs"])
+            for mine, other in zip(ours[4]["final_obs"], theirs[4]["final_obs"], strict=True):
+                assert (mine is None) == (other is None)
+                assert mine is None or np.array_equal(mine, other)
+
+
+@every_id
+def test_disabled_autoreset_wants_finished_copies_reset(env_id):
+    env = make_vec(env_id, 2, AutoresetMode.DISABLED, max_episode_steps=2)
+    env.reset(seed=0)
+    zero = np.zeros(env.action_space.shape)
+    env.step(zero)
+    assert env.step(zero)[3].all()
+    with pytest.raises(gym.error.ResetNeeded, match="copy 0 has finished"):
+        env.step(zero)
+    env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(gym.error.ResetNeeded, match="copy 1 has finished"):
+        env.step(zero)
+    env.reset(options={"reset_mask": np.array([False, True])})
+    env.step(zero)
+
+
+@every_id
+def test_state_can_be_read_and_set(env_id):
+    env, vector = gym.make(env_id), make_vec(env_id, 3)
+    state = np.linspace(0.1, 0.3, env.unwrapped.system.n_state)
+    env.reset(options={"state": state})
+    assert np.array_equal(env.unwrapped.state, state)
+    states = np.stack([state, 2 * state, -state])
+    vector.reset(options={"state": states})
+    assert np.array_equal(vector.unwrapped.state, states)
+    env.unwrapped.state[:] = 5.0  # a copy: writing to it changes nothing
+    assert np.array_equal(env.unwrapped.state, state)
+    with pytest.raises(ValueError, match=r"expected a start state of shape .* got \(1,\)"):
+        env.reset(options={"state": [0.0]})
+    with pytest.raises(ValueError, match="expected a finite start state"):
+        env.reset(options={"state": state * np.nan})
+    with pytest.raises(ValueError, match="unknown reset option 'stat'"):
+        env.reset(options={"stat": state})
+
+
+@every_id
+def test_hints_are_the_state_and_only_there_when_asked_for(env_id):
+    assert gym.make(env_id).reset(seed=0)[1] == {}
+    env = gym.make(env_id, hint=True)
+    _, info = env.reset(seed=0)
+    assert np.array_equal(info["hint"], env.unwrapped.state)
+    vector = make_vec(env_id, 3, hint=True, max_episode_steps=1)
+    vector.reset(seed=0)
+    before = vector.unwrapped.state
+    _, _, _, truncated, infos = vector.step(np.zeros(vector.action_space.shape))
+    assert truncated.all()
+    assert np.array_equal(infos["hint"], vector.unwrapped.state)
+    expected = vector.unwrapped.system.step(before, np.zeros((3, vector.unwrapped.system.n_action)))
+    assert infos["final_info"]["hint"] == pytest.approx(expected, abs=1e-12)  # the kernels' last bit
+    assert infos["final_info"]["state"] == pytest.approx(expected, abs=1e-12)
+
+
+@every_id
+def test_names_stand_for_every_component(env_id):
+    env = gym.make(env_id).unwrapped
+    assert len(env.observation_names) == env.observation_space.shape[0]
+    assert len(env.action_names) == env.action_space.shape[0]
+    system = env.system
+    assert len(system.state_names) == len(env.state)
+    assert set(env.observation_names) <= set(system.observation_names)
+    for name in (*system.state_names, *system.observation_names, *system.action_names):
+        assert name in type(system).__doc__, f"the data sheet lacks {name}"
+
+
+@every_id
+def test_numpy_torch_and_compiled_steps_agree(env_id):
+    system = gym.make(env_id, **NOISY).unwrapped.system
+    rng = np.random.default_rng(0)
+    state = rng.normal(size=(200, system.n_state))
+    low, high = system.action_limits
+    action = rng.uniform(1.2 * low, 1.2 * high, (200, system.n_action))
+    noise = rng.standard_normal((200, system.noise_size))
+    with_numpy = system.step(state, action, noise)
+    with_torch = system.step(*(torch.from_numpy(a) for a in (state, action, noise)))
+    assert with_torch.numpy() == pytest.approx(with_numpy, rel=1e-12, abs=1e-12)  # the last bits of a sine
+    for function in ("observe", "terminated", "stage_cost"):
+        arrays = (with_numpy,) if function != "stage_cost" else (with_numpy, action)
+        expected = getattr(system, function)(*arrays)
+        found = getattr(system, function)(*(torch.from_numpy(a) for a in arrays)).numpy()
+        assert found == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+@every_id
+@pytest.mark.parametrize("kwargs", [{}, NOISY], ids=["exact", "noisy"])
+def test_the_compiled_loop_is_the_system(env_id, kwargs):
+    pytest.importorskip("numba", reason="without numba every system runs under numpy")
+    from beliefgym.envs.kernel import NumbaKernel, NumpyKernel
+
+    system = gym.make(env_id, **kwargs).unwrapped.system
+    rng = np.random.default_rng(1)
+    n = 300
+    state = 2.0 * rng.normal(size=(n, system.n_state))
+    low, high = system.action_limits
+    action = rng.uniform(1.5 * low, 1.5 * high, (n, system.n_action))
+    noise = rng.standard_normal((n, system.noise_size)) if system.noise_size else None
+    columns = (1, 0)
+    results = []
+    for kernel in (NumbaKernel(system, columns), NumpyKernel(system, columns)):
+        steps = np.arange(n)
+        out = np.empty_like(state), np.empty(n), np.empty(n, dtype=bool), np.empty(n, dtype=bool)
+        flags = kernel.step(state, action, noise, steps, 250, *out)
+        results.append((np.array(flags), steps, kernel.observe(out[0]), *out))
+    for mine, other in zip(*results, strict=True):
+        assert np.asarray(mine, dtype=float) == pytest.approx(np.asarray(other, dtype=float), rel=1e-12, abs=1e-12)
+
+
+@every_id
+def test_wrong_actions_are_told(env_id):
+    env, vector = gym.make(env_id).unwrapped, make_vec(env_id, 3)
+    env.reset(seed=0)
+    vector.reset(seed=0)
+    n_action = env.system.n_action
+    with pytest.raises(ValueError, match=rf"expected an action of shape \({n_action},\) .* got shape \(7,\)"):
+        env.step(np.zeros(7))
+    with pytest.raises(ValueError, match=rf"expected an action of shape \(3, {n_action}\) .* got shape \(2, 1\)"):
+        vector.step(np.zeros((2, 1)))
+    before = vector.unwrapped.state
+    actions = np.zeros((3, n_action))
+    vector.step(actions)
+    actions[1, -1] = np.nan
+    with pytest.raises(ValueError, match=f"action '{env.action_names[-1]}' of copy 1 is NaN at step 2"):
+        vector.step(actions)
+    assert not np.isnan(vector.unwrapped.state).any()  # nothing is lost: the states are those before
+    assert not np.array_equal(vector.unwrapped.state, before)
+    with pytest.raises(ValueError, match="of copy 0 is NaN at step 1"):
+        env.step(np.full(n_action, np.nan))
+    env.step(np.full(n_action, np.inf))  # clipped to the limit, like any number beyond it
+
+
+@every_id
+def test_a_diverging_simulation_is_told_where_it_begins(env_id):
+    vector = make_vec(env_id, 3)
+    vector.reset(seed=0)
+    states = vector.unwrapped.state
+    states[2] = 1e308
+    vector.reset(options={"state": states})
+    with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match="of copy 2 became .* at step 1 of its episode"):
+        vector.step(np.zeros(vector.action_space.shape))
+
+
+@every_id
+def test_step_before_reset_is_told(env_id):
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        gym.make(env_id).unwrapped.step(np.zeros(1))
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        make_vec(env_id, 2).step(np.zeros((2, 1)))
+
+
+@every_id
+def test_it_draws_itself(env_id):
+    env = gym.make(env_id, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (480, 720, 3)
+    assert first.dtype == np.uint8
+    for _ in range(10):
+        env.step(env.action_space.high)
+    assert (env.render() != first).any(axis=2).mean() > 0.002  # something has moved
+    vector = make_vec(env_id, 2, render_mode="rgb_array")
+    vector.reset(seed=0)
+    frames = vector.render()
+    assert len(frames) == 2
+    assert np.array_equal(frames[0], first)
+
+
+@every_id
+def test_it_is_filmed_by_gymnasiums_record_video(env_id, tmp_path):
+    pytest.importorskip("moviepy", reason="the video extra is not installed")
+    env = gym.wrappers.RecordVideo(
+        gym.make(env_id, render_mode="rgb_array", max_episode_steps=5), str(tmp_path), disable_logger=True
+    )
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    env.close()
+    assert [path.stat().st_size > 1000 for path in tmp_path.glob("*.mp4")] == [True]
+
+
+@every_id
+def test_a_window_opens_and_closes(env_id, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gym.make(env_id, render_mode="human")
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    assert env.render() is None
+    env.close()
+    env.close()
