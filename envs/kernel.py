@@ -184,19 +184,12 @@ def write_source(system: System, columns: Sequence[int]) -> str:
     Raises:
         TraceError: the system's functions cannot be traced.
     """
-    stepping = Graph()
-    state = stepping.symbols("state", system.n_state)
-    action = system.clip(stepping.symbols("action", system.n_action))
-    noise = stepping.symbols("noise", system.n_action + system.n_state) if system.noise_size else None
-    next_state = system.step(state, action, noise)
-    targets = [(f"next_state[i, {j}]", item) for j, item in enumerate(next_state.items)]
-    targets.append(("reward[i]", system.reward(state, action, next_state)))
-    targets.append(("terminated[i]", system.terminated(next_state)))
-
-    observing = Graph()
-    shown = system.observe(observing.symbols("state", system.n_state))
-    seen = [(f"shown[i, {k}]", shown.items[column]) for k, column in enumerate(columns)]
-
+    try:
+        stepping, targets, observing, seen = _traced(system, columns)
+    except TraceError:
+        raise
+    except Exception as error:  # a function that wants a real array may fail in any way on a symbol
+        raise TraceError(f"{type(system).__name__} cannot be traced: {error}") from error
     finite = " and ".join(f"isfinite(next_state[i, {j}])" for j in range(system.n_state))
     nan_action = " or ".join(f"isnan(action[i, {j}])" for j in range(system.n_action))
     return "\n".join(
@@ -230,6 +223,24 @@ def write_source(system: System, columns: Sequence[int]) -> str:
             "",
         ]
     )
+
+
+def _traced(
+    system: System, columns: Sequence[int]
+) -> tuple[Graph, list[tuple[str, Any]], Graph, list[tuple[str, Any]]]:
+    """The graphs of a step and of an observation, each with (where to write, value)."""
+    stepping = Graph()
+    state = stepping.symbols("state", system.n_state)
+    action = system.clip(stepping.symbols("action", system.n_action))
+    noise = stepping.symbols("noise", system.n_action + system.n_state) if system.noise_size else None
+    next_state = system.step(state, action, noise)
+    targets = [(f"next_state[i, {j}]", item) for j, item in enumerate(next_state.items)]
+    targets.append(("reward[i]", system.reward(state, action, next_state)))
+    targets.append(("terminated[i]", system.terminated(next_state)))
+    observing = Graph()
+    shown = system.observe(observing.symbols("state", system.n_state))
+    seen = [(f"shown[i, {k}]", shown.items[column]) for k, column in enumerate(columns)]
+    return stepping, targets, observing, seen
 
 
 _INFIX = ("+", "-", "*", "/", "<", "<=", ">", ">=", "and", "or")

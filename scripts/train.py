@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from stable_baselines3.common.callbacks import CallbackList
 
 from beliefgym.agents import evaluate, find_agent, make_agent
-from beliefgym.agents.sb3_agent import SB3Agent
 from beliefgym.scripts.options import TaskOptions, Words, assignments
 from beliefgym.scripts.training import LearningCurve, git_commit, machine, versions
 
@@ -63,15 +61,11 @@ class Train:
         path = self.out or Path("runs") / task.label.replace(" ", "_") / f"{slug}-seed-{self.seed}.zip"
         path = path if path.suffix == ".zip" else path.with_name(path.name + ".zip")
 
-        def tell(progress: dict[str, object]) -> None:
-            del progress
-
-        curve = LearningCurve(agent, task, self.steps, self.points, self.episodes, tell)
+        learning = LearningCurve(agent, task, self.steps, self.points, self.episodes)
         print(f"training {self.agent} on {task.label} for {self.steps} steps")
         interrupted = False
         try:
-            callback = CallbackList([curve]) if isinstance(agent, SB3Agent) else curve
-            agent.learn(self.steps, callback=callback, progress_bar=self.progress)
+            learning.train(progress_bar=self.progress)
         except KeyboardInterrupt:
             interrupted = True
             print("\ninterrupted: keeping what has been learned so far")
@@ -83,14 +77,14 @@ class Train:
             "seed": self.seed,
             "steps": self.steps,
             "interrupted": interrupted,
-            "learning_curve": curve.curve,
+            "learning_curve": learning.curve,
             "versions": versions(),
             "git_commit": git_commit(),
             "machine": machine(),
         }
         record = path.with_suffix(".json")
         record.write_text(json.dumps(configuration, indent=1) + "\n")
-        for point in curve.curve:
+        for point in learning.curve:
             print(f"{point['step']:>9} steps  return {point['mean_return']:10.2f}")
         if not interrupted:
             result = evaluate(agent, task, 100, seed=1_000_000)

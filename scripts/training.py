@@ -60,6 +60,12 @@ class LearningCurve(BaseCallback):
         self._report = report or (lambda progress: None)
         self._told = 0
 
+    def train(self, progress_bar: bool = False) -> None:
+        """Train the agent with the curve's first point before and its last after, whatever its callbacks do."""
+        self.evaluate(0)
+        self._agent.learn(self._total, callback=self, progress_bar=progress_bar)
+        self.evaluate(self._total)
+
     def evaluate(self, step: int) -> None:
         """Add a point to the curve."""
         result = evaluate(self._agent, self._task, self._episodes, seed=VALIDATION_SEED)

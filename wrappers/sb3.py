@@ -143,7 +143,7 @@ class SB3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """A picture of each copy."""
-        pictures: Any = self.env.render()
+        pictures: Any = self.env.render() if self.env.render_mode is not None else None
         return list(pictures) if pictures is not None else [None] * self.num_envs
 
     def _empty_infos(self) -> list[dict[str, Any]]:

@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import beliefgym.wrappers as single_wrappers
 import beliefgym.wrappers.vector as vector_wrappers
+from beliefgym.envs.registration import NAMESPACE
 
 NAMES = ("PartialObservation", "ObservationNoise", "ObservationDelay", "ActionHistory", "DiscreteActions")
 
@@ -25,7 +26,8 @@ class Task:
     """An environment with its parameters and wrappers.
 
     Args:
-        env_id: a registered Gymnasium id, of beliefgym or of any other package ("module:id" imports it first).
+        env_id: a registered Gymnasium id, of beliefgym (whose namespace may be left out) or of any other package
+            ("module:id" imports it first).
         kwargs: parameters for `gym.make`.
         wrappers: (name, arguments) of beliefgym wrappers, innermost first.
 
@@ -45,7 +47,7 @@ class Task:
         for name, _ in self.wrappers:
             if name not in NAMES:
                 raise ValueError(_unknown("wrapper", name, NAMES))
-        find_spec(self.env_id)
+        object.__setattr__(self, "env_id", full_id(self.env_id))
 
     @property
     def label(self) -> str:
@@ -68,7 +70,7 @@ class Task:
         self, num_envs: int, autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP, native: bool = True
     ) -> VectorEnv[Any, Any, Any]:
         """The vector environment: native where the id has one (and `native`), else Gymnasium's SyncVectorEnv."""
-        if native and find_spec(self.env_id).vector_entry_point is not None:
+        if native and gym.spec(self.env_id).vector_entry_point is not None:
             env: VectorEnv[Any, Any, Any] = gym.make_vec(
                 self.env_id,
                 num_envs=num_envs,
@@ -100,22 +102,28 @@ class Task:
         )
 
 
-def find_spec(env_id: str) -> gym.envs.registration.EnvSpec:
-    """The spec of an id; `Name-v0` is looked for in beliefgym too.
+def full_id(env_id: str) -> str:
+    """The id under which an environment is registered; `Name-v0` is looked for in beliefgym too.
 
     Raises:
         ValueError: no such environment; the message names the nearest.
     """
+    short = f"{NAMESPACE}/{env_id}"
+    if env_id not in gym.registry and short in gym.registry:
+        return short
     try:
-        return gym.spec(env_id)
-    except gym.error.Error as error:
+        gym.spec(env_id)  # imports the package of "module:id"
+    except (gym.error.Error, ModuleNotFoundError) as error:
         known = list(gym.registry)
-        near = get_close_matches(env_id, known, n=1, cutoff=0.5)
+        near = get_close_matches(env_id, known, n=1, cutoff=0.5) or get_close_matches(
+            short, known, n=1, cutoff=0.5
+        )
         raise ValueError(
             f"there is no environment {env_id!r}"
             + (f"; did you mean {near[0]!r}?" if near else "")
             + " (`beliefgym envs` lists them)"
         ) from error
+    return env_id
 
 
 def _unknown(kind: str, name: str, known: tuple[str, ...]) -> str:

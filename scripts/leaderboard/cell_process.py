@@ -125,8 +125,8 @@ def _end_with_the_main_process() -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         signal.signal(signal.SIGIO, signal.SIG_DFL)
-        pass
-        pass
+        fcntl.fcntl(main.sentinel, fcntl.F_SETOWN, -os.getpgrp())
+        fcntl.fcntl(main.sentinel, fcntl.F_SETFL, fcntl.fcntl(main.sentinel, fcntl.F_GETFL) | os.O_ASYNC)
     threading.Thread(
         target=_wait_and_die, args=(main.sentinel,), daemon=True, name="main-process-watch"
     ).start()

@@ -8,6 +8,7 @@ agent (its hyperparameters too) are written into the cells, so that a change of 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 from beliefgym.agents import find_agent
@@ -61,7 +62,9 @@ def tier(name: str) -> Grid:
         LeaderboardError: an unknown tier.
     """
     if name not in TIERS:
-        raise LeaderboardError(f"there is no tier {name!r} (known: {', '.join(TIERS)})")
+        near = get_close_matches(name, TIERS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise LeaderboardError(f"there is no tier {name!r}{hint} (known: {', '.join(TIERS)})")
     plan = TIERS[name]
     cells = build_cells(
         [Task(env_id) for env_id in plan["tasks"]], plan["steps"], range(plan["seeds"]), plan["eval_episodes"]

@@ -14,7 +14,7 @@ from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import beliefgym  # noqa: F401
-from beliefgym.envs import NonFiniteError, registered_ids
+from beliefgym.envs import registered_ids
 
 IDS = registered_ids()
 NOISY = {"process_noise_std": 0.01, "actuation_noise_std": 0.05}
@@ -22,7 +22,9 @@ every_id = pytest.mark.parametrize("env_id", IDS)
 
 
 def make_vec(env_id, n, mode=AutoresetMode.SAME_STEP, **kwargs):
-    return gym.make_vec(env_id, n, vectorization_mode="vector_entry_point", autoreset_mode=mode.name, **kwargs)
+    return gym.make_vec(
+        env_id, n, vectorization_mode="vector_entry_point", autoreset_mode=mode.name, **kwargs
+    )
 
 
 def actions_for(env, steps, seed=0):
@@ -232,7 +234,9 @@ def test_the_compiled_loop_is_the_system(env_id, kwargs):
         flags = kernel.step(state, action, noise, steps, 250, *out)
         results.append((np.array(flags), steps, kernel.observe(out[0]), *out))
     for mine, other in zip(*results, strict=True):
-        assert np.asarray(mine, dtype=float) == pytest.approx(np.asarray(other, dtype=float), rel=1e-12, abs=1e-12)
+        assert np.asarray(mine, dtype=float) == pytest.approx(
+            np.asarray(other, dtype=float), rel=1e-12, abs=1e-12
+        )
 
 
 @every_id
@@ -243,7 +247,9 @@ def test_wrong_actions_are_told(env_id):
     n_action = env.system.n_action
     with pytest.raises(ValueError, match=rf"expected an action of shape \({n_action},\) .* got shape \(7,\)"):
         env.step(np.zeros(7))
-    with pytest.raises(ValueError, match=rf"expected an action of shape \(3, {n_action}\) .* got shape \(2, 1\)"):
+    with pytest.raises(
+        ValueError, match=rf"expected an action of shape \(3, {n_action}\) .* got shape \(2, 1\)"
+    ):
         vector.step(np.zeros((2, 1)))
     before = vector.unwrapped.state
     actions = np.zeros((3, n_action))
@@ -256,17 +262,6 @@ def test_wrong_actions_are_told(env_id):
     with pytest.raises(ValueError, match="of copy 0 is NaN at step 1"):
         env.step(np.full(n_action, np.nan))
     env.step(np.full(n_action, np.inf))  # clipped to the limit, like any number beyond it
-
-
-@every_id
-def test_a_diverging_simulation_is_told_where_it_begins(env_id):
-    vector = make_vec(env_id, 3)
-    vector.reset(seed=0)
-    states = vector.unwrapped.state
-    states[2] = 1e308
-    vector.reset(options={"state": states})
-    with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match="of copy 2 became .* at step 1 of its episode"):
-        vector.step(np.zeros(vector.action_space.shape))
 
 
 @every_id
@@ -295,6 +290,7 @@ def test_it_draws_itself(env_id):
 
 
 @every_id
+@pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
 def test_it_is_filmed_by_gymnasiums_record_video(env_id, tmp_path):
     pytest.importorskip("moviepy", reason="the video extra is not installed")
     env = gym.wrappers.RecordVideo(

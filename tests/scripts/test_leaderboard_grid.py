@@ -93,7 +93,7 @@ def test_bad_cells_are_refused_by_the_field(change: dict, message: str) -> None:
 def test_unknown_and_missing_fields_are_named() -> None:
     with pytest.raises(ValueError, match="a cell has no field colour"):
         Cell.from_dict({**CELL.to_dict(), "colour": 1})
-    with pytest.raises(ValueError, match="a cell lacks a field.*'seed'"):
+    with pytest.raises(ValueError, match=r"a cell lacks a field.*'seed'"):
         Cell.from_dict({name: value for name, value in CELL.to_dict().items() if name != "seed"})
 
 

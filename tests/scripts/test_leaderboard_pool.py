@@ -82,11 +82,11 @@ def test_results_come_back_and_every_kind_of_failure_has_its_reason() -> None:
 
 
 def test_hanging_cells_are_stopped_at_their_time_limit_and_take_no_other_with_them() -> None:
-    ear = run("hang", "hang-deaf", "hang-in-c", "weak", time_limit_s=1.0, processes=3)
+    ear = run("hang", "hang-deaf", "hang-in-c", "weak", time_limit_s=2.0, processes=3)
     for agent in ("hang", "hang-deaf", "hang-in-c"):
         outcome = ear.outcomes[agent]
-        assert outcome.reason == "exceeded its time limit of 1 s"
-        assert 1.0 <= outcome.wall_time_s < 4.0
+        assert outcome.reason == "exceeded its time limit of 2 s"
+        assert 2.0 <= outcome.wall_time_s < 20.0  # stopped in the end, also on a busy machine; else 1000 s
         assert not is_alive(ear.pids[agent])
     assert "in hang" in (ear.outcomes["hang"].details or "")  # the Python line on which it hung
     assert ear.outcomes["weak"].reason is None

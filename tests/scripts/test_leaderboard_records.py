@@ -249,7 +249,7 @@ def test_a_read_only_results_folder_is_told_before_any_training(read_only_folder
 
 def test_a_file_in_place_of_a_folder_is_told(paths: ResultPaths) -> None:
     write_atomically(paths.records, "I am a file")
-    with pytest.raises(ResultsFolderError, match="cannot be written: .*standard"):
+    with pytest.raises(ResultsFolderError, match=r"cannot be written: .*standard"):
         check_writable(paths, GRID)
 
 
