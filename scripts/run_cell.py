@@ -33,13 +33,11 @@ def run_cell(cell_data: Mapping[str, Any], report: Callable[[dict[str, Any]], No
     curve: list[dict[str, float]] = []
     started = time.perf_counter()
     if cell.total_timesteps:
-        callback = LearningCurve(
+        learning = LearningCurve(
             agent, task, cell.total_timesteps, cell.curve_points, cell.curve_episodes, report
         )
-        callback.evaluate(0)
-        agent.learn(cell.total_timesteps, callback=callback)
-        callback.evaluate(cell.total_timesteps)
-        curve = callback.curve
+        learning.train()
+        curve = learning.curve
     training_time = time.perf_counter() - started
     report({"step": cell.total_timesteps, "total": cell.total_timesteps, "note": "evaluating"})
     started = time.perf_counter()

@@ -36,7 +36,7 @@ class Leaderboard:
     time_limit: float = 3600.0
     """Seconds after which one of its cells is stopped and becomes a failed row."""
     results_dir: Path = Path("results")
-    """Folder of records, tables and figures; the tier's name is a folder below it."""
+    """Folder of records, tables and figures; only one leaderboard at a time works in it."""
     processes: int = 2
     """Cells at a time, each on one thread."""
     redo_changed: bool = False
