@@ -88,6 +88,16 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._shown.names
 
     @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the components of the true state, and of the hint."""
+        return self.system.state_names
+
+    @property
+    def hint_names(self) -> tuple[str, ...] | None:
+        """Names of the hint's components, if hints were asked for."""
+        return self.system.state_names if self._hint else None
+
+    @property
     def action_names(self) -> tuple[str, ...]:
         """Names of the action components."""
         return self.system.action_names

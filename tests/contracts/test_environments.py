@@ -214,6 +214,24 @@ def test_numpy_torch_and_compiled_steps_agree(env_id):
 
 
 @every_id
+def test_it_uses_nothing_beyond_the_array_api(env_id):
+    strict = pytest.importorskip("array_api_strict", reason="array-api-strict is not installed")
+    system = gym.make(env_id, **NOISY).unwrapped.system
+    rng = np.random.default_rng(2)
+    shapes = {"state": system.n_state, "action": system.n_action, "noise": system.noise_size}
+    given = {name: rng.normal(size=(20, size)) for name, size in shapes.items()}
+    state, action, noise = (strict.asarray(array) for array in given.values())
+    found = system.step(state, action, noise)
+    assert np.asarray(found) == pytest.approx(system.step(*given.values()), rel=1e-12)
+    for function in ("observe", "terminated"):
+        assert np.asarray(getattr(system, function)(state)) == pytest.approx(
+            getattr(system, function)(given["state"])
+        )
+    assert np.asarray(system.reward(state, action, found)).shape == (20,)
+    assert np.asarray(system.stage_cost(state, action)).shape == (20,)
+
+
+@every_id
 @pytest.mark.parametrize("kwargs", [{}, NOISY], ids=["exact", "noisy"])
 def test_the_compiled_loop_is_the_system(env_id, kwargs):
     pytest.importorskip("numba", reason="without numba every system runs under numpy")
