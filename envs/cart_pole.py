@@ -142,8 +142,8 @@ class CartPole(System):
         return spread + np.array([0.0, 0.0, np.pi, 0.0])
 
     def expert(self) -> Any:
-        """Iterative LQR from the start state, tracked by its own gains."""
-        from beliefgym.envs.planning.ilqr import cart_pole_expert
+        """Iterative LQR on the true model, tracked by its own gains; LQR once upright."""
+        from beliefgym.envs.planning.cart_pole_expert import cart_pole_expert
 
         return cart_pole_expert(self)
 
