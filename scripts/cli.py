@@ -57,6 +57,8 @@ def _run(arguments: list[str]) -> int:
     from beliefgym.scripts.leaderboard.errors import LeaderboardError
 
     torch.set_num_threads(int(THREADS))
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())  # so that module:attribute finds a file of the user's beside him
     command: Any = tyro.extras.subcommand_cli_from_dict(
         commands(),
         prog="beliefgym",

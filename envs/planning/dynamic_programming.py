@@ -29,11 +29,11 @@ from beliefgym.envs.system import System
 
 Floats = NDArray[np.float64]
 
-SWEEPS = 10
+SWEEPS = 20
 MAX_IMPROVEMENTS = 200
-ANGLES, SPEEDS = 480, 481  # nodes of the pendulum's grid; both have a node at 0
-TORQUES, HELD_TORQUES, LOOKAHEAD_TORQUES = 11, 3, 41
-HELD_FOR = (0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8)  # s
+ANGLES, SPEEDS = 640, 513  # nodes of the pendulum's grid; both have a node at 0, on the coarser grid too
+TORQUES, HELD_TORQUES, LOOKAHEAD_TORQUES = 9, 3, 41
+HELD_FOR = (0.1, 0.2, 0.4, 0.8)  # s
 
 
 @dataclass(frozen=True)
@@ -224,9 +224,18 @@ def pendulum_expert(system: Pendulum) -> GridController:
 @lru_cache(maxsize=8)
 def _pendulum_value(system: Pendulum) -> GridValue:
     speed = min(system.max_speed, speed_bound(system))
-    axes = Axis(-np.pi, np.pi, ANGLES, periodic=True), Axis(-speed, speed, SPEEDS)
     holds = sorted({round(seconds / system.dt) for seconds in HELD_FOR} - {0, 1})
-    return value_iteration(system, axes, _torques(system, TORQUES), _torques(system, HELD_TORQUES), holds)
+    value: GridValue | None = None
+    for coarser in (2, 1):
+        axes = (
+            Axis(-np.pi, np.pi, ANGLES // coarser, periodic=True),
+            Axis(-speed, speed, (SPEEDS - 1) // coarser + 1),
+        )
+        value = value_iteration(
+            system, axes, _torques(system, TORQUES), _torques(system, HELD_TORQUES), holds, start=value
+        )
+    assert value is not None
+    return value
 
 
 def speed_bound(system: Pendulum) -> float:

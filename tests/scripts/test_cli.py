@@ -2,8 +2,10 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -158,6 +160,42 @@ def test_ctrl_c_keeps_what_was_learned(tmp_path, monkeypatch, capsys):
     assert json.loads(path.with_suffix(".json").read_text())["interrupted"] is True
     assert "keeping what has been learned" in capsys.readouterr().out
     assert run("evaluate", str(path), "--episodes", "2") == 0
+
+
+def test_an_agent_in_the_users_own_folder_joins(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\n"
+        "from beliefgym.agents import RandomAgent\n"
+        "class Still(RandomAgent):\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=False):\n"
+        "        return np.zeros((len(observation), 1), dtype=np.float32), None\n"
+    )
+    command = [
+        "leaderboard",
+        "--name",
+        "mine",
+        "--envs",
+        "Pendulum-v0",
+        "--agents",
+        "mine:Still",
+        "--steps",
+        "10",
+    ]
+    done = subprocess.run(
+        [
+            shutil.which("beliefgym", path=Path(sys.executable).parent),
+            *command,
+            "--seeds",
+            "1",
+            "--processes",
+            "1",
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "mine:Still" in (tmp_path / "results" / "leaderboard_mine.md").read_text()
 
 
 def test_python_m_beliefgym():
