@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from beliefgym.scripts.leaderboard.folder import ResultPaths
 from beliefgym.scripts.leaderboard.grid import Grid
+from beliefgym.scripts.leaderboard.rescore import rescore
 from beliefgym.scripts.leaderboard.run import LeaderboardOptions, run_leaderboard
 from beliefgym.scripts.leaderboard.tiers import RUNNER, build_cells, tier
 from beliefgym.wrappers.task import Task
@@ -45,10 +47,15 @@ class Leaderboard:
     """Leave failed cells as they are; otherwise they are tried again."""
     report_only: bool = False
     """Run nothing; write tables and figures from the records there are."""
+    rescore: bool = False
+    """First put the present reference scores (`beliefgym envs --measure`) into the finished records."""
 
     def run(self) -> int:
         """Run; 0, 1 where cells have failed, 2 where it could not start, 130 after Ctrl-C."""
         grid = self._grid()
+        if self.rescore:
+            changed = rescore(grid, ResultPaths(self.results_dir, grid.name))
+            print(f"{changed} records now hold the present reference scores")
         options = LeaderboardOptions(
             grid=grid,
             runner=RUNNER,
