@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -77,13 +78,17 @@ class Record:
         """Record through Gymnasium's RecordVideo and print the paths."""
         agent = agent_from(self.agent, self.task)
         name = f"{agent.registered_name or 'agent'}-{agent.task.label.replace(' ', '_')}"
-        env = gym.wrappers.RecordVideo(
-            agent.task.make(render_mode="rgb_array"),
-            str(self.out),
-            episode_trigger=lambda episode: True,
-            name_prefix=name,
-            disable_logger=True,
-        )
+        with warnings.catch_warnings():
+            warnings.filterwarnings(
+                "ignore", message=".*Overwriting existing videos"
+            )  # only those of this name
+            env = gym.wrappers.RecordVideo(
+                agent.task.make(render_mode="rgb_array"),
+                str(self.out),
+                episode_trigger=lambda episode: True,
+                name_prefix=name,
+                disable_logger=True,
+            )
         agent.set_env(env)
         for episode in range(self.episodes):
             observation, _ = env.reset(seed=self.seed + episode)

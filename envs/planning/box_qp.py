@@ -64,7 +64,8 @@ def solve_free(hessian: Floats, free: NDArray[np.bool_], right: Floats) -> Float
         return free[..., None] * right / hessian
     both = free[:, :, None] & free[:, None, :]
     reduced = np.where(both, hessian, 0.0) + np.eye(hessian.shape[1]) * ~free[:, :, None]
-    return np.linalg.solve(reduced, right * free[..., None])
+    solved: Floats = np.linalg.solve(reduced, right * free[..., None])
+    return solved
 
 
 def _times(matrices: Floats, vectors: Floats) -> Floats:

@@ -6,7 +6,7 @@ It minimises what the reward lacks of its highest value 1, and a barrier before 
 
 with P, K of the infinite-horizon LQR at the upright (theta taken in [-pi, pi)). A plan is made in three steps:
 the best plans of two trees of held actions, each continued by the LQR; the best of these as the first guess of
-iLQR; and then u_t + K_t (s - s_t) is applied until the plan ends, -K s afterwards. A copy plans anew when a new
+iLQR; then u_t + K_t (s - s_t) is applied until the plan ends, -K s afterwards. A copy plans anew when a new
 episode begins, and when the state has left the plan so far that the deviation's LQR cost d' P d / 2 is above a
 threshold; then the rest of the old plan is one of the guesses. There is no randomness.
 """
@@ -99,6 +99,11 @@ class CartPoleController:
             max_iterations=60,
             tolerance=1e-4,
         )
+        self.states: Floats
+        self.actions: Floats
+        self.gains: Floats
+        self.clock: NDArray[np.int64]
+        self.planned: NDArray[np.bool_]
         self._forget(0)
 
     def act(self, state: ArrayLike, restart: ArrayLike | None = None) -> Floats:
@@ -127,11 +132,11 @@ class CartPoleController:
             if restart.shape != (len(state),):
                 raise ValueError(f"expected restart as ({len(state)},), got shape {restart.shape}")
             self.planned &= ~restart
-        reference, action, gain, deviation = self._on_plan(state)
+        action, gain, deviation = self._on_plan(state)
         again = np.flatnonzero(~self.planned | (self.upright_cost(deviation) > REPLAN_COST))
         if len(again):
             self._plan(state, again)
-            reference, action, gain, deviation = self._on_plan(state)
+            action, gain, deviation = self._on_plan(state)
         self.clock = np.minimum(self.clock + 1, self.horizon)
         return self.system.clip(action + (gain @ deviation[..., None])[..., 0])
 
@@ -144,11 +149,10 @@ class CartPoleController:
         self.clock = np.zeros(copies, dtype=np.int64)
         self.planned = np.zeros(copies, dtype=bool)
 
-    def _on_plan(self, state: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Planned state, action and gain of the present step, and the deviation from it."""
+    def _on_plan(self, state: Floats) -> tuple[Floats, Floats, Floats]:
+        """The planned action and gain of the present step, and the deviation from the planned state."""
         at = np.arange(len(state)), self.clock
-        reference = self.states[at]
-        return reference, self.actions[at], self.gains[at], from_upright(state - reference)
+        return self.actions[at], self.gains[at], from_upright(state - self.states[at])
 
     def _plan(self, state: Floats, rows: NDArray[np.int64]) -> None:
         start = state[rows]
@@ -205,7 +209,9 @@ class CartPoleController:
         for t in range(self.horizon):
             at = rows, np.minimum(self.clock[rows] + t, self.horizon)
             deviation = from_upright(state - self.states[at])
-            actions[:, t] = self.system.clip(self.actions[at] + (self.gains[at] @ deviation[..., None])[..., 0])
+            actions[:, t] = self.system.clip(
+                self.actions[at] + (self.gains[at] @ deviation[..., None])[..., 0]
+            )
             cost += self.stage_cost(state, actions[:, t])
             state = self.system.flow(state, actions[:, t])
         return actions, cost + self.upright_cost(state)

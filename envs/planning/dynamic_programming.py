@@ -7,8 +7,9 @@ The value of a state is what an optimal controller will pay from it on, and solv
 where an action u may be held for k steps. Holding adds nothing to what can be reached, but it replaces k
 interpolations of V, each with an error, by one: it halves what the expert loses to the grid. V is bilinear between
 the nodes. It is found by modified policy iteration (Puterman 2005, Sec. 6.5): choose the best (u, k) at each node,
-apply them `SWEEPS` times, and repeat until V changes equally everywhere (the span criterion of Puterman, Sec. 8.5.4,
-which also ends where every controller must go on paying, and so V grows for ever).
+apply them `SWEEPS` times, and repeat until V changes equally everywhere (the span criterion, Puterman, Sec. 8.5.4).
+Where some states can never get to rest, V grows there for ever; then it ends after `MAX_IMPROVEMENTS`, when the
+policy has long settled.
 
 At run time the controller looks one step ahead, over a fine set of actions: argmin_u c(s, u) + gamma V(f(s, u)). A
 parabola through the best three made it worse, since V has a kink at each grid line.
@@ -25,79 +26,16 @@ import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.pendulum import Pendulum
+from beliefgym.envs.planning.grid import Axis, GridValue, bilinear, table_of
 from beliefgym.envs.system import System
 
 Floats = NDArray[np.float64]
 
-SWEEPS = 20
-MAX_IMPROVEMENTS = 200
-ANGLES, SPEEDS = 640, 513  # nodes of the pendulum's grid; both have a node at 0, on the coarser grid too
+SWEEPS = 20  # applications of a policy between two improvements
+MAX_IMPROVEMENTS = 25
+ANGLES, SPEEDS = 640, 513  # nodes of the pendulum's grid; both have one at 0, so has the grid half as fine
 TORQUES, HELD_TORQUES, LOOKAHEAD_TORQUES = 9, 3, 41
 HELD_FOR = (0.1, 0.2, 0.4, 0.8)  # s
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One state component of a grid.
-
-    Args:
-        low, high: its range; a periodic component repeats after high - low.
-        nodes: number of grid nodes; both ends are nodes, except that a periodic component's high is its low.
-        periodic: whether it is an angle.
-
-    Raises:
-        ValueError: fewer than 2 nodes or an empty range.
-    """
-
-    low: float
-    high: float
-    nodes: int
-    periodic: bool = False
-
-    def __post_init__(self) -> None:
-        if self.nodes < 2 or not self.low < self.high or not np.isfinite(self.high - self.low):
-            raise ValueError(f"expected at least 2 nodes in a finite range that is not empty, got {self}")
-
-    @property
-    def points(self) -> Floats:
-        """The nodes, (nodes,)."""
-        return np.linspace(self.low, self.high, self.nodes, endpoint=not self.periodic)
-
-    @property
-    def columns(self) -> int:
-        """Nodes with the repeated one of a periodic axis."""
-        return self.nodes + self.periodic
-
-    def locate(self, values: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """The cell of each value and its place in it, in 0..1; beyond the range, the nearest place within it."""
-        place = (values - self.low) * ((self.columns - 1) / (self.high - self.low))
-        place = place % self.nodes if self.periodic else np.minimum(np.maximum(place, 0.0), self.nodes - 1)
-        cell = np.minimum(place.astype(np.intp), self.columns - 2)
-        return cell, place - cell
-
-
-@dataclass(frozen=True, eq=False)
-class GridValue:
-    """V on a grid, bilinear between the nodes.
-
-    Attributes:
-        axes: of the two state components.
-        table: (axes[0].columns, axes[1].columns).
-        improvements: policy improvements that were made.
-        converged: whether the last one changed V equally everywhere.
-    """
-
-    axes: tuple[Axis, Axis]
-    table: Floats
-    improvements: int
-    converged: bool
-
-    def __call__(self, state: Floats) -> Floats:
-        """V at states (..., 2) -> (...)."""
-        i, p = self.axes[0].locate(state[..., 0])
-        j, q = self.axes[1].locate(state[..., 1])
-        corner = i * self.table.shape[1] + j
-        return _bilinear(self.table.ravel(), self.table.shape[1], corner, p, q)
 
 
 def value_iteration(
@@ -125,7 +63,7 @@ def value_iteration(
 
     Raises:
         ValueError: a system with another number of state components, actions of a wrong shape, or a discount
-            outside (0, 1].
+            outside (0, 1], or a hold below 2.
     """
     if system.n_state != 2:
         raise ValueError(
@@ -133,21 +71,24 @@ def value_iteration(
         )
     if not 0.0 < discount <= 1.0:
         raise ValueError(f"expected discount in (0, 1], got {discount!r}")
+    if any(k < 2 for k in holds):
+        raise ValueError(f"expected holds of at least 2 steps, got {list(holds)}")
     nodes = np.stack(np.meshgrid(*(axis.points for axis in axes), indexing="ij"), axis=-1).reshape(-1, 2)
-    plans = [(u, (1,)) for u in _actions(system, actions)]
-    if holds:
-        plans += [(u, tuple(holds)) for u in _actions(system, actions if held_actions is None else held_actions)]
+    once = _actions(system, actions)
+    held = once if held_actions is None else _actions(system, held_actions)
+    plans: list[tuple[Floats, Sequence[int]]] = [(u, (1,)) for u in once]
+    plans += [(u, holds) for u in held if holds]
     choices = [c for u, lengths in plans for c in _hold(system, axes, nodes, u, lengths, discount)]
 
-    count, width, every = len(nodes), axes[1].columns, np.arange(len(nodes))
+    count, width = len(nodes), axes[1].columns
     value = np.zeros(count) if start is None else start(nodes)
     best_value, best = np.empty(count), np.empty(count, dtype=np.intp)
     converged, improvements = False, 0
     while not converged and improvements < MAX_IMPROVEMENTS:
-        table = _table(value, axes).ravel()
+        table = table_of(value, axes).ravel()
         best_value.fill(np.inf)
         for c, choice in enumerate(choices):
-            candidate = choice.cost + choice.factor * _bilinear(table, width, choice.corner, *choice.place)
+            candidate = choice.cost + choice.factor * bilinear(table, width, choice.corner, *choice.place)
             lower = candidate < best_value
             best_value[lower], best[lower] = candidate[lower], c
         change = best_value - value
@@ -158,7 +99,7 @@ def value_iteration(
             paid, policy = _apply(choices, best, axes)
             for _ in range(SWEEPS):
                 value = paid + policy @ value
-    return GridValue(axes, _table(value, axes), improvements, converged)
+    return GridValue(axes, table_of(value, axes), improvements, converged)
 
 
 class GridController:
@@ -225,17 +166,13 @@ def pendulum_expert(system: Pendulum) -> GridController:
 def _pendulum_value(system: Pendulum) -> GridValue:
     speed = min(system.max_speed, speed_bound(system))
     holds = sorted({round(seconds / system.dt) for seconds in HELD_FOR} - {0, 1})
-    value: GridValue | None = None
-    for coarser in (2, 1):
-        axes = (
-            Axis(-np.pi, np.pi, ANGLES // coarser, periodic=True),
-            Axis(-speed, speed, (SPEEDS - 1) // coarser + 1),
-        )
-        value = value_iteration(
-            system, axes, _torques(system, TORQUES), _torques(system, HELD_TORQUES), holds, start=value
-        )
-    assert value is not None
-    return value
+    tried = _torques(system, TORQUES), _torques(system, HELD_TORQUES), holds
+
+    def axes(coarser: int) -> tuple[Axis, Axis]:
+        angle = Axis(-np.pi, np.pi, ANGLES // coarser, periodic=True)
+        return angle, Axis(-speed, speed, (SPEEDS - 1) // coarser + 1)
+
+    return value_iteration(system, axes(1), *tried, start=value_iteration(system, axes(2), *tried))
 
 
 def speed_bound(system: Pendulum) -> float:
@@ -259,7 +196,9 @@ def _torques(system: Pendulum, count: int) -> Floats:
 def _actions(system: System, actions: ArrayLike) -> Floats:
     array = np.asarray(actions, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != system.n_action or not len(array):
-        raise ValueError(f"expected actions as (k, {system.n_action}) with k above 0, got shape {array.shape}")
+        raise ValueError(
+            f"expected actions as (k, {system.n_action}) with k above 0, got shape {array.shape}"
+        )
     return system.clip(array)
 
 
@@ -279,7 +218,12 @@ class _Choice:
 
 
 def _hold(
-    system: System, axes: tuple[Axis, Axis], nodes: Floats, action: Floats, holds: Sequence[int], discount: float
+    system: System,
+    axes: tuple[Axis, Axis],
+    nodes: Floats,
+    action: Floats,
+    holds: Sequence[int],
+    discount: float,
 ) -> list[_Choice]:
     """The choices to hold one action for each of some numbers of steps."""
     actions = np.broadcast_to(action, (len(nodes), len(action)))
@@ -297,22 +241,10 @@ def _hold(
             i, p = axes[0].locate(states[:, 0])
             j, q = axes[1].locate(states[:, 1])
             corner = (i * axes[1].columns + j).astype(np.int32)
-            choices.append(_Choice(cost.astype(np.float32), factor, corner, np.stack([p, q]).astype(np.float32)))
+            choices.append(
+                _Choice(cost.astype(np.float32), factor, corner, np.stack([p, q]).astype(np.float32))
+            )
     return choices
-
-
-def _bilinear(table: Floats, width: int, corner: NDArray, p: NDArray, q: NDArray) -> Floats:
-    """Interpolate in a flat table whose rows have this width; corner is the cell's lowest node."""
-    here = table[corner]
-    low = here + (table[corner + 1] - here) * q
-    there = table[corner + width]
-    return low + (there + (table[corner + (width + 1)] - there) * q - low) * p
-
-
-def _table(value: Floats, axes: tuple[Axis, Axis]) -> Floats:
-    """The values at the nodes as a table, with the repeated column of a periodic axis."""
-    table = value.reshape(axes[0].nodes, axes[1].nodes)
-    return np.pad(table, [(0, axis.columns - axis.nodes) for axis in axes], mode="wrap")
 
 
 def _apply(
@@ -320,7 +252,12 @@ def _apply(
 ) -> tuple[Floats, scipy.sparse.csr_matrix]:
     """The cost of the chosen choice at each node, and the matrix from V at the nodes to factor V where it leads."""
     count, (rows, columns) = len(best), (axes[0].nodes, axes[1].nodes)
-    paid, factor, corner, place = np.empty(count), np.empty(count), np.empty(count, np.int64), np.empty((2, count))
+    paid, factor, corner, place = (
+        np.empty(count),
+        np.empty(count),
+        np.empty(count, np.int64),
+        np.empty((2, count)),
+    )
     for c, choice in enumerate(choices):
         chosen = best == c
         paid[chosen], corner[chosen] = choice.cost[chosen], choice.corner[chosen]

@@ -139,11 +139,12 @@ class ILQR:
             raise ValueError(f"expected initial_state as (b, {n}), got shape {start.shape}")
         if actions is None:
             actions = np.zeros((len(start), horizon, m))
-        expected = {"initial_actions": (actions, (horizon, m))}
+        expected: dict[str, tuple[Any, tuple[int, ...]]] = {"initial_actions": (actions, (horizon, m))}
         if (gains is None) != (reference is None):
             raise ValueError("initial_gains and initial_states belong together: pass both or neither")
         if gains is not None:
-            reference = np.asarray(reference)[:, :horizon]
+            reference = np.asarray(reference)
+            reference = reference[:, :horizon] if reference.ndim == 3 else reference
             expected["initial_gains"] = (gains, (horizon, m, n))
             expected["initial_states"] = (reference, (horizon, n))
         arrays = []
@@ -156,7 +157,9 @@ class ILQR:
                 raise ValueError(f"{name} of problem {row} is not finite")
             arrays.append(np.ascontiguousarray(array.swapaxes(0, 1)))
         if not np.isfinite(start).all():
-            raise ValueError(f"initial_state of problem {int(np.argwhere(~np.isfinite(start))[0][0])} is not finite")
+            raise ValueError(
+                f"initial_state of problem {int(np.argwhere(~np.isfinite(start))[0][0])} is not finite"
+            )
         return start, arrays[0], *((arrays[1], arrays[2]) if gains is not None else (None, None))
 
 
@@ -169,7 +172,7 @@ class _Search:
         self.problem = problem
         self.low, self.high = problem.system.action_limits
         b, n, m, horizon = len(start), start.shape[1], actions.shape[2], problem.horizon
-        if gains is None:
+        if gains is None or reference is None:
             gains, reference = np.zeros((horizon, b, m, n)), np.zeros((horizon, b, n))
         states, self.actions = self._roll_out(start[None], actions[:, None], gains, reference)
         self.states, self.actions = states[:, 0], self.actions[:, 0]
@@ -192,6 +195,14 @@ class _Search:
         self.terminal = (np.zeros((b, n)), np.zeros((b, n, n)))
 
     def solution(self) -> ILQRSolution:
+        """The plans, with undamped gains about their last trajectories."""
+        rows = np.flatnonzero(~self.converged | (self.mu > 0.0))
+        if len(rows):
+            self.active = rows
+            self.mu[rows] = 0.0
+            self._differentiate()
+            self.gains[:, rows] = self._backward(rows)[1]
+
         def rows_first(array: Floats) -> Floats:
             return np.ascontiguousarray(array.swapaxes(0, 1))
 
@@ -279,7 +290,9 @@ class _Search:
         for mine, new in zip(self.stage, expand_cost(self.problem._stage, states[:-1], actions), strict=True):
             mine[:, rows] = new
         if self.problem.terminal_cost is not None:
-            for mine, new in zip(self.terminal, expand_cost(self.problem.terminal_cost, states[-1]), strict=True):
+            for mine, new in zip(
+                self.terminal, expand_cost(self.problem.terminal_cost, states[-1]), strict=True
+            ):
                 mine[rows] = new
 
     def _backward(self, rows: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
@@ -306,7 +319,10 @@ class _Search:
             turned = gain.swapaxes(1, 2)
             quu_step = (q_uu @ step[..., None])[..., 0]
             expected -= (step * (q_u + 0.5 * quu_step)).sum(axis=1)
-            v = q[:, :n] + (turned @ (quu_step + q_u)[..., None] + q_us.swapaxes(1, 2) @ step[..., None])[..., 0]
+            v = (
+                q[:, :n]
+                + (turned @ (quu_step + q_u)[..., None] + q_us.swapaxes(1, 2) @ step[..., None])[..., 0]
+            )
             vv = qq[:, :n, :n] + turned @ (q_uu @ gain + q_us) + q_us.swapaxes(1, 2) @ gain
             vv = 0.5 * (vv + vv.swapaxes(1, 2))
             steps[t], gains[t] = step, gain

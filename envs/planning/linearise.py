@@ -100,7 +100,9 @@ def clip_eigenvalues(matrices: Floats) -> Floats:
     """
     size = matrices.shape[-1]
     coupled = np.flatnonzero((matrices * ~np.eye(size, dtype=bool)).any(axis=0).any(axis=0))
-    clipped = np.maximum(matrices, 0.0) * np.eye(size)  # exact for what is coupled to nothing: cheap and common
+    clipped = np.maximum(matrices, 0.0) * np.eye(
+        size
+    )  # exact for what is coupled to nothing: cheap and common
     if len(coupled):
         block = np.ix_(np.arange(len(matrices)), coupled, coupled)
         values, vectors = np.linalg.eigh(matrices[block])

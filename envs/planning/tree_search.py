@@ -69,7 +69,9 @@ def tree_search(
         raise ValueError(f"tree_search needs finite action limits, got {low} to {high}")
     levels = np.array(list(product(*np.stack([low, 0.5 * (low + high), high], axis=1))))  # (3^m, m)
     branches = len(levels)
-    first = np.cumsum([0] + [branches**d for d in range(depth + 1)])  # first node of each depth; nodes breadth first
+    first = np.cumsum(
+        [0] + [branches**d for d in range(depth + 1)]
+    )  # first node of each depth; nodes breadth first
     if keep > first[-1]:
         raise ValueError(f"expected keep of at most {first[-1]}, the number of nodes, got {keep}")
     chunk = max(1, LEAVES_AT_ONCE // branches**depth)
@@ -80,7 +82,9 @@ def tree_search(
     nodes, costs = (np.concatenate(parts) for parts in zip(*ranked, strict=True))
     depths = np.searchsorted(first, nodes, side="right") - 1
     index = nodes - first[depths]
-    digits = np.stack([index // branches ** np.maximum(depths - d, 0) % branches for d in range(1, depth + 1)], axis=-1)
+    digits = np.stack(
+        [index // branches ** np.maximum(depths - d, 0) % branches for d in range(1, depth + 1)], axis=-1
+    )
     used = np.arange(1, depth + 1) <= depths[..., None]
     actions = np.where(used[..., None], levels[digits], 0.0)
     return TreePlans(np.repeat(actions, hold, axis=2), depths * hold, costs)
@@ -102,7 +106,8 @@ def _rank(
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(depth):
             actions = np.broadcast_to(
-                np.tile(levels, (states.shape[1], 1)), (len(state), states.shape[1] * len(levels), levels.shape[1])
+                np.tile(levels, (states.shape[1], 1)),
+                (len(state), states.shape[1] * len(levels), levels.shape[1]),
             )
             states, so_far = np.repeat(states, len(levels), axis=1), np.repeat(so_far, len(levels), axis=1)
             for _ in range(hold):
@@ -112,5 +117,7 @@ def _rank(
     every = np.concatenate(costs, axis=1)
     every = np.where(np.isfinite(every), every, np.inf)
     best = np.argpartition(every, keep - 1, axis=1)[:, :keep]
-    best = np.take_along_axis(best, np.argsort(np.take_along_axis(every, best, axis=1), axis=1, kind="stable"), axis=1)
+    best = np.take_along_axis(
+        best, np.argsort(np.take_along_axis(every, best, axis=1), axis=1, kind="stable"), axis=1
+    )
     return best, np.take_along_axis(every, best, axis=1)

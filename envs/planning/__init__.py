@@ -1,0 +1,24 @@
+"""Planners and experts: batched optimal control on a `System`'s true model. They know no Gymnasium."""
+
+from beliefgym.envs.planning.cart_pole_expert import CartPoleController, cart_pole_expert
+from beliefgym.envs.planning.dynamic_programming import GridController, pendulum_expert, value_iteration
+from beliefgym.envs.planning.grid import Axis, GridValue
+from beliefgym.envs.planning.ilqr import ILQR, ILQRSolution
+from beliefgym.envs.planning.linearise import expand_cost, linearise
+from beliefgym.envs.planning.tree_search import TreePlans, tree_search
+
+__all__ = [
+    "ILQR",
+    "Axis",
+    "CartPoleController",
+    "GridController",
+    "GridValue",
+    "ILQRSolution",
+    "TreePlans",
+    "cart_pole_expert",
+    "expand_cost",
+    "linearise",
+    "pendulum_expert",
+    "tree_search",
+    "value_iteration",
+]
