@@ -88,6 +88,11 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._shown.names
 
     @property
+    def kernel_name(self) -> str:
+        """What steps it: "numba" (a fused, compiled loop) or "numpy"; see kernel.py."""
+        return self._simulation.kernel.name
+
+    @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the components of the true state, and of the hint."""
         return self.system.state_names

@@ -101,6 +101,11 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
         return self._shown.names
 
     @property
+    def kernel_name(self) -> str:
+        """What steps it: "numba" (a fused, compiled loop) or "numpy"; see kernel.py."""
+        return self._simulation.kernel.name
+
+    @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the components of the true state, and of the hint."""
         return self.system.state_names

@@ -43,6 +43,7 @@ def run_cell(cell_data: Mapping[str, Any], report: Callable[[dict[str, Any]], No
     started = time.perf_counter()
     result = evaluate(agent, task, cell.eval_episodes, seed=cell.eval_seed)
     env = task.make()
+    kernel = getattr(env.unwrapped, "kernel_name", None)
     spec = env.spec.to_json() if env.spec is not None else None
     env.close()
     return {
@@ -58,6 +59,7 @@ def run_cell(cell_data: Mapping[str, Any], report: Callable[[dict[str, Any]], No
         },
         "evaluation": {"episodes": cell.eval_episodes, "wall_time_s": time.perf_counter() - started},
         "spec": spec,
+        "kernel": kernel,
         "versions": versions(),
         "git_commit": git_commit(),
         "machine": machine(),

@@ -19,6 +19,7 @@ PACKAGES = (
     "beliefgym",
     "gymnasium",
     "mujoco",
+    "numba",
     "numpy",
     "stable-baselines3",
     "sb3-contrib",
