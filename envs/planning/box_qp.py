@@ -42,7 +42,9 @@ def box_qp(hessian: Floats, gradient: Floats, low: Floats, high: Floats) -> tupl
         step = _inward_step(hessian, slope, d, low, high)
         to_bound = np.full_like(d, np.inf)  # how far each component may go, in steps
         np.divide(np.where(step > 0, high - d, low - d), step, out=to_bound, where=step != 0)
-        sizes = np.where(to_bound < 1.0, to_bound * (1.0 + 1e-12), 1.0).T  # a little more, so that clip meets it
+        sizes = np.where(
+            to_bound < 1.0, to_bound * (1.0 + 1e-12), 1.0
+        ).T  # a little more, so that clip meets it
         sizes = np.concatenate([sizes, np.broadcast_to(STEP_SIZES[:, None], (len(STEP_SIZES), len(d)))])
         moved = np.clip(d + sizes[..., None] * step, low, high)  # (step sizes, b, m)
         value = (moved * (gradient + 0.5 * _times(hessian, moved))).sum(axis=2)

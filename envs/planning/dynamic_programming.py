@@ -7,9 +7,8 @@ The value of a state is what an optimal controller will pay from it on, and solv
 where an action u may be held for k steps. Holding adds nothing to what can be reached, but it replaces k
 interpolations of V, each with an error, by one: it halves what the expert loses to the grid. V is bilinear between
 the nodes. It is found by modified policy iteration (Puterman 2005, Sec. 6.5): choose the best (u, k) at each node,
-apply them `SWEEPS` times, and repeat until V changes equally everywhere (the span criterion, Puterman, Sec. 8.5.4).
-Where some states can never get to rest, V grows there for ever; then it ends after `MAX_IMPROVEMENTS`, when the
-policy has long settled.
+apply them `SWEEPS` times, and repeat until V no longer changes. Where some states can never get to rest, V grows
+there for ever if gamma is 1; then it ends after `max_improvements`, when the policy has long settled.
 
 At run time the controller looks one step ahead, over a fine set of actions: argmin_u c(s, u) + gamma V(f(s, u)). A
 parabola through the best three made it worse, since V has a kink at each grid line.
@@ -32,7 +31,6 @@ from beliefgym.envs.system import System
 Floats = NDArray[np.float64]
 
 SWEEPS = 20  # applications of a policy between two improvements
-MAX_IMPROVEMENTS = 25
 ANGLES, SPEEDS = 640, 513  # nodes of the pendulum's grid; both have one at 0, so has the grid half as fine
 TORQUES, HELD_TORQUES, LOOKAHEAD_TORQUES = 9, 3, 41
 HELD_FOR = (0.1, 0.2, 0.4, 0.8)  # s
@@ -47,6 +45,7 @@ def value_iteration(
     *,
     discount: float = 1.0,
     tolerance: float = 1e-4,
+    max_improvements: int = 25,
     start: GridValue | None = None,
 ) -> GridValue:
     """Solve the equation of the module for a system with two state components.
@@ -58,7 +57,8 @@ def value_iteration(
         held_actions: (h, m), tried for each of `holds` steps; `actions` if None.
         holds: numbers of steps, each above 1.
         discount: gamma, in (0, 1].
-        tolerance: V has converged when the change of one improvement differs by less between any two nodes.
+        tolerance: V has converged when an improvement changes it by less at every node.
+        max_improvements: policy improvements after which it ends in any case.
         start: a first guess of V, such as one of a coarser grid; 0 if None.
 
     Raises:
@@ -84,17 +84,16 @@ def value_iteration(
     value = np.zeros(count) if start is None else start(nodes)
     best_value, best = np.empty(count), np.empty(count, dtype=np.intp)
     converged, improvements = False, 0
-    while not converged and improvements < MAX_IMPROVEMENTS:
+    while not converged and improvements < max_improvements:
         table = table_of(value, axes).ravel()
         best_value.fill(np.inf)
         for c, choice in enumerate(choices):
             candidate = choice.cost + choice.factor * bilinear(table, width, choice.corner, *choice.place)
             lower = candidate < best_value
             best_value[lower], best[lower] = candidate[lower], c
-        change = best_value - value
+        converged = bool(np.abs(best_value - value).max() < tolerance)
         value = best_value.copy()
         improvements += 1
-        converged = bool(np.ptp(change) < tolerance)
         if not converged:
             paid, policy = _apply(choices, best, axes)
             for _ in range(SWEEPS):

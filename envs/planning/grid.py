@@ -66,7 +66,7 @@ class GridValue:
         axes: of the two state components.
         table: (axes[0].columns, axes[1].columns).
         improvements: policy improvements that were made.
-        converged: whether the last one changed V equally everywhere.
+        converged: whether the last one left V as it was.
     """
 
     axes: tuple[Axis, Axis]

@@ -88,17 +88,21 @@ def test_a_derivative_that_is_not_finite_names_its_place() -> None:
     state[1, 2, 3] = np.inf
     with pytest.raises(ValueError, match=r"Jacobian of CartPole\.flow is not finite at batch index \(1, 2\)"):
         linearise(CartPole(), state, np.zeros((2, 3, 1)))
-    with pytest.raises(ValueError, match=r"gradient of CartPole\.stage_cost is not finite at batch index \(1, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"gradient of CartPole\.stage_cost is not finite at batch index \(1, 2\)"
+    ):
         expand_cost(CartPole().stage_cost, state, np.zeros((2, 3, 1)))
+
+    def root(s: Any) -> Any:
+        return torch.abs(s[..., 0]) ** 1.5
+
     with pytest.raises(ValueError, match=r"Hessian of .*root.* is not finite at batch index \(0,\)"):
-
-        def root(s: Any) -> Any:
-            return torch.abs(s[..., 0]) ** 1.5
-
         expand_cost(root, np.zeros((1, 1)))
 
 
-@pytest.mark.parametrize(("state", "action"), [((5, 3), (5, 1)), ((5, 4), (5, 2)), ((5, 4), (4, 1)), ((), (1,))])
+@pytest.mark.parametrize(
+    ("state", "action"), [((5, 3), (5, 1)), ((5, 4), (5, 2)), ((5, 4), (4, 1)), ((), (1,))]
+)
 def test_wrong_shapes_say_what_was_expected(state: tuple[int, ...], action: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"CartPole expects states \(\.\.\., 4\) and actions \(\.\.\., 1\)"):
         linearise(CartPole(), np.zeros(state), np.zeros(action))
