@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 NAMESPACE = "beliefgym"
+VECTOR_ENTRY_POINT = "beliefgym.envs.vector_env:SystemVectorEnv"
 
 
 def register_system(
@@ -36,7 +37,7 @@ def register_system(
         gym.register(
             id=f"{NAMESPACE}/{name}{suffix}-v{version}",
             entry_point="beliefgym.envs.env:SystemEnv",
-            vector_entry_point="beliefgym.envs.vector_env:SystemVectorEnv",
+            vector_entry_point=VECTOR_ENTRY_POINT,
             max_episode_steps=max_episode_steps,
             kwargs=kwargs,
         )

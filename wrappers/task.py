@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import beliefgym.wrappers as single_wrappers
 import beliefgym.wrappers.vector as vector_wrappers
-from beliefgym.envs.registration import NAMESPACE
+from beliefgym.envs.registration import NAMESPACE, VECTOR_ENTRY_POINT
 
 NAMES = ("PartialObservation", "ObservationNoise", "ObservationDelay", "ActionHistory", "DiscreteActions")
 
@@ -69,8 +69,8 @@ class Task:
     def make_vec(
         self, num_envs: int, autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP, native: bool = True
     ) -> VectorEnv[Any, Any, Any]:
-        """The vector environment: native where the id has one (and `native`), else Gymnasium's SyncVectorEnv."""
-        if native and gym.spec(self.env_id).vector_entry_point is not None:
+        """The vector environment: native where a system has one (and `native`), else Gymnasium's SyncVectorEnv."""
+        if native and gym.spec(self.env_id).vector_entry_point == VECTOR_ENTRY_POINT:
             env: VectorEnv[Any, Any, Any] = gym.make_vec(
                 self.env_id,
                 num_envs=num_envs,

@@ -32,6 +32,7 @@ TREES = ((0.15, 8), (0.25, 7))  # s for which an action is held, and how many ac
 KEEP = 8  # plans of each tree that are continued by the LQR
 HORIZON = 3.0  # s
 BARRIER, BARRIER_START = 20.0, 5.0 / 6.0  # 1/m^2, and from which part of the track on
+PLANS_AT_ONCE = 512  # bounds the memory
 REPLAN_COST = 1.0  # in units of reward
 
 
@@ -135,7 +136,8 @@ class CartPoleController:
         action, gain, deviation = self._on_plan(state)
         again = np.flatnonzero(~self.planned | (self.upright_cost(deviation) > REPLAN_COST))
         if len(again):
-            self._plan(state, again)
+            for first in range(0, len(again), PLANS_AT_ONCE):
+                self._plan(state, again[first : first + PLANS_AT_ONCE])
             action, gain, deviation = self._on_plan(state)
         self.clock = np.minimum(self.clock + 1, self.horizon)
         return self.system.clip(action + (gain @ deviation[..., None])[..., 0])

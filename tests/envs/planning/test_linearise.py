@@ -70,6 +70,16 @@ def test_positive_keeps_a_convex_cost_and_removes_negative_curvature(linear_clas
     np.testing.assert_allclose(saddle[0], [[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.0, 0.0]], atol=1e-15)
 
 
+def test_a_linear_cost_has_no_curvature_and_no_grad_mode_changes_nothing() -> None:
+    with torch.no_grad():
+        gradient, hessian = expand_cost(lambda s: 2.0 * s[..., 0] - s[..., 1], np.ones((3, 2)))
+        a, _ = linearise(Pendulum(), np.zeros((1, 2)), np.zeros((1, 1)))
+    np.testing.assert_array_equal(gradient, [[2.0, -1.0]] * 3)
+    np.testing.assert_array_equal(hessian, np.zeros((3, 2, 2)))
+    # Rod at the top: w' = w + dt 3 g / (2 l) theta = w + 0.75 theta, theta' = theta + dt w'.
+    np.testing.assert_allclose(a[0], [[1.0375, 0.05], [0.75, 1.0]], rtol=1e-14)
+
+
 def test_clipping_is_the_nearest_positive_semidefinite_matrix() -> None:
     rng = np.random.default_rng(2)
     matrices = rng.normal(size=(50, 4, 4))
