@@ -143,7 +143,7 @@ class CartPole(System):
 
     def expert(self) -> Any:
         """Iterative LQR on the true model, tracked by its own gains; LQR once upright."""
-        from beliefgym.envs.planning.cart_pole_expert import cart_pole_expert
+        from beliefgym.envs.planning.cart_pole import cart_pole_expert
 
         return cart_pole_expert(self)
 

@@ -1,11 +1,11 @@
 """Planners and experts: batched optimal control on a `System`'s true model. They know no Gymnasium."""
 
-from beliefgym.envs.planning.cart_pole_expert import CartPoleController, cart_pole_expert
+from beliefgym.envs.planning.action_tree import TreePlans, tree_search
+from beliefgym.envs.planning.cart_pole import CartPoleController, cart_pole_expert
 from beliefgym.envs.planning.dynamic_programming import GridController, pendulum_expert, value_iteration
 from beliefgym.envs.planning.grid import Axis, GridValue
 from beliefgym.envs.planning.ilqr import ILQR, ILQRSolution
-from beliefgym.envs.planning.linearise import expand_cost, linearise
-from beliefgym.envs.planning.tree_search import TreePlans, tree_search
+from beliefgym.envs.planning.linearisation import expand_cost, linearise
 
 __all__ = [
     "ILQR",

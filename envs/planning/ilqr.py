@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.planning.box_qp import box_qp, solve_free
-from beliefgym.envs.planning.linearise import expand_cost, linearise
+from beliefgym.envs.planning.linearisation import expand_cost, linearise
 from beliefgym.envs.system import System
 
 Floats = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beliefgym.envs.cart_pole import CartPole
-from beliefgym.envs.planning.cart_pole_expert import CartPoleController, cart_pole_expert
+from beliefgym.envs.planning.cart_pole import CartPoleController, cart_pole_expert
 from beliefgym.envs.system import wrap_angle
 
 

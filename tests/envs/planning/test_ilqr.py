@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 from beliefgym.envs.cart_pole import CartPole
 from beliefgym.envs.pendulum import Pendulum
 from beliefgym.envs.planning.ilqr import ILQR
-from beliefgym.envs.planning.linearise import expand_cost, linearise
+from beliefgym.envs.planning.linearisation import expand_cost, linearise
 
 
 def riccati(system: Any, horizon: int) -> tuple[list[np.ndarray], np.ndarray]:

@@ -21,9 +21,9 @@ from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.cart_pole import CartPole
+from beliefgym.envs.planning.action_tree import tree_search
 from beliefgym.envs.planning.ilqr import ILQR
-from beliefgym.envs.planning.linearise import expand_cost, linearise
-from beliefgym.envs.planning.tree_search import tree_search
+from beliefgym.envs.planning.linearisation import expand_cost, linearise
 from beliefgym.envs.system import Array, wrap_angle
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ import torch
 
 from beliefgym.envs.cart_pole import CartPole
 from beliefgym.envs.pendulum import Pendulum
-from beliefgym.envs.planning.linearise import clip_eigenvalues, expand_cost, linearise
+from beliefgym.envs.planning.linearisation import clip_eigenvalues, expand_cost, linearise
 
 
 def central_differences(function: Any, z: np.ndarray, step: float = 1e-6) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beliefgym.envs.cart_pole import CartPole
-from beliefgym.envs.planning.tree_search import tree_search
+from beliefgym.envs.planning.action_tree import tree_search
 
 
 def terminal(state: Any) -> Any:
