@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from beliefgym.envs.description import Described
 from beliefgym.envs.observation import Shown
 from beliefgym.envs.random_streams import spread_seeds
 from beliefgym.envs.simulation import Simulation, start_state
@@ -39,7 +40,7 @@ def action_space(system: System) -> Box:
     return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
-class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class SystemEnv(Described, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One copy of a system as a Gymnasium environment.
 
     `env.unwrapped.state` is the true state; `reset(options={"state": s})` starts from s. The same seed gives the
@@ -81,31 +82,6 @@ class SystemEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def state(self) -> NDArray[np.float64]:
         """(n_state,) the true state."""
         return self._simulation.state[0].copy()
-
-    @property
-    def observation_names(self) -> tuple[str, ...]:
-        """Names of the components that are shown."""
-        return self._shown.names
-
-    @property
-    def kernel_name(self) -> str:
-        """What steps it: "numba" (a fused, compiled loop) or "numpy"; see kernel.py."""
-        return self._simulation.kernel.name
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the components of the true state, and of the hint."""
-        return self.system.state_names
-
-    @property
-    def hint_names(self) -> tuple[str, ...] | None:
-        """Names of the hint's components, if hints were asked for."""
-        return self.system.state_names if self._hint else None
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the action components."""
-        return self.system.action_names
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

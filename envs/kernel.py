@@ -19,7 +19,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,15 @@ from beliefgym.envs.tracing import Graph, Scalar, TraceError
 
 NOT_FINITE, NAN_ACTION, TERMINATED, TRUNCATED = 1, 2, 4, 8
 NO_LIMIT = np.iinfo(np.int64).max
+
+
+class Outcome(NamedTuple):
+    """Where a kernel writes what a step gives: (n, n_state), (n,), (n,), (n,)."""
+
+    next_state: NDArray[np.float64]
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
 
 
 class Kernel(Protocol):
@@ -43,17 +52,14 @@ class Kernel(Protocol):
         noise: NDArray[np.float64] | None,
         steps: NDArray[np.int64],
         limit: int,
-        next_state: NDArray[np.float64],
-        reward: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
+        out: Outcome,
     ) -> int:
         """One control period of every copy.
 
         Args:
             state: (n, n_state). action: (n, n_action). noise: (n, n_action + n_state) or None.
             steps: (n,) steps taken; one is added. limit: steps after which an episode is truncated.
-            next_state, reward, terminated, truncated: (n, n_state), (n,), (n,), (n,), written.
+            out: written.
 
         Returns:
             a sum of NOT_FINITE, NAN_ACTION, TERMINATED and TRUNCATED: whether any copy is so.
@@ -85,22 +91,19 @@ class NumpyKernel:
         noise: NDArray[np.float64] | None,
         steps: NDArray[np.int64],
         limit: int,
-        next_state: NDArray[np.float64],
-        reward: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
+        out: Outcome,
     ) -> int:
         """See `Kernel.step`."""
         system = self._system
         action = system.clip(action)
-        next_state[...] = system.step(state, action, noise)
-        reward[...] = system.reward(state, action, next_state)
-        terminated[...] = system.terminated(next_state)
+        out.next_state[...] = system.step(state, action, noise)
+        out.reward[...] = system.reward(state, action, out.next_state)
+        out.terminated[...] = system.terminated(out.next_state)
         steps += 1
-        truncated[...] = steps >= limit
-        flags = TERMINATED * bool(terminated.any()) + TRUNCATED * bool(truncated.any())
-        if not np.isfinite(next_state.sum()):
-            flags += NOT_FINITE * (not np.isfinite(next_state).all())
+        out.truncated[...] = steps >= limit
+        flags = TERMINATED * bool(out.terminated.any()) + TRUNCATED * bool(out.truncated.any())
+        if not np.isfinite(out.next_state.sum()):
+            flags += NOT_FINITE * (not np.isfinite(out.next_state).all())
         if np.isnan(action.sum()):
             flags += NAN_ACTION * bool(np.isnan(action).any())
         return flags
@@ -140,14 +143,11 @@ class NumbaKernel:
         noise: NDArray[np.float64] | None,
         steps: NDArray[np.int64],
         limit: int,
-        next_state: NDArray[np.float64],
-        reward: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
+        out: Outcome,
     ) -> int:
         """See `Kernel.step`."""
         noise = self._no_noise if noise is None else noise
-        return self._step(state, action, noise, steps, limit, next_state, reward, terminated, truncated)
+        return self._step(state, action, noise, steps, limit, *out)
 
     def observe(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
         """See `Kernel.observe`."""

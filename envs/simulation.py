@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefgym.envs.kernel import NAN_ACTION, NO_LIMIT, NOT_FINITE, TERMINATED, TRUNCATED, make_kernel
+from beliefgym.envs.kernel import (
+    NAN_ACTION,
+    NO_LIMIT,
+    NOT_FINITE,
+    TERMINATED,
+    TRUNCATED,
+    Outcome,
+    make_kernel,
+)
 from beliefgym.envs.random_streams import RandomStreams, fresh_seeds
 from beliefgym.envs.system import System
 
@@ -118,9 +126,8 @@ class Simulation:
         reward = np.empty(n)
         terminated = np.empty(n, dtype=np.bool_)
         truncated = np.empty(n, dtype=np.bool_)
-        flags = self.kernel.step(
-            state, action, noise, self.steps, self._limit, next_state, reward, terminated, truncated
-        )
+        out = Outcome(next_state, reward, terminated, truncated)
+        flags = self.kernel.step(state, action, noise, self.steps, self._limit, out)
         if active is not None:
             still = ~active
             self.steps[still] -= 1

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from beliefgym.envs.description import Described
 from beliefgym.envs.env import RENDER_MODES, action_space, load_system
 from beliefgym.envs.observation import Shown
 from beliefgym.envs.random_streams import spread_seeds
@@ -20,7 +21,7 @@ from beliefgym.envs.system import System
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 
 
-class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+class SystemVectorEnv(Described, VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
     """n copies of a system as one Gymnasium vector environment.
 
     Copy i of `reset(seed=s)` goes through the trajectory that the single environment goes through after
@@ -94,31 +95,6 @@ class SystemVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArra
     def autoreset_mode(self) -> AutoresetMode:
         """When finished copies start anew (TorchRL asks for it by this name, as SyncVectorEnv has it)."""
         return self._mode
-
-    @property
-    def observation_names(self) -> tuple[str, ...]:
-        """Names of the components that are shown."""
-        return self._shown.names
-
-    @property
-    def kernel_name(self) -> str:
-        """What steps it: "numba" (a fused, compiled loop) or "numpy"; see kernel.py."""
-        return self._simulation.kernel.name
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the components of the true state, and of the hint."""
-        return self.system.state_names
-
-    @property
-    def hint_names(self) -> tuple[str, ...] | None:
-        """Names of the hint's components, if hints were asked for."""
-        return self.system.state_names if self._hint else None
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the action components."""
-        return self.system.action_names
 
     def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

@@ -235,7 +235,7 @@ def test_it_uses_nothing_beyond_the_array_api(env_id):
 @pytest.mark.parametrize("kwargs", [{}, NOISY], ids=["exact", "noisy"])
 def test_the_compiled_loop_is_the_system(env_id, kwargs):
     pytest.importorskip("numba", reason="without numba every system runs under numpy")
-    from beliefgym.envs.kernel import NumbaKernel, NumpyKernel
+    from beliefgym.envs.kernel import NumbaKernel, NumpyKernel, Outcome
 
     system = gym.make(env_id, **kwargs).unwrapped.system
     rng = np.random.default_rng(1)
@@ -249,7 +249,7 @@ def test_the_compiled_loop_is_the_system(env_id, kwargs):
     for kernel in (NumbaKernel(system, columns), NumpyKernel(system, columns)):
         steps = np.arange(n)
         out = np.empty_like(state), np.empty(n), np.empty(n, dtype=bool), np.empty(n, dtype=bool)
-        flags = kernel.step(state, action, noise, steps, 250, *out)
+        flags = kernel.step(state, action, noise, steps, 250, Outcome(*out))
         results.append((np.array(flags), steps, kernel.observe(out[0]), *out))
     for mine, other in zip(*results, strict=True):
         assert np.asarray(mine, dtype=float) == pytest.approx(
