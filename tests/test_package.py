@@ -1,6 +1,7 @@
 """The package as a user installs it: its modules, its symbolic links, its names, and its two commands."""
 
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
