@@ -22,7 +22,8 @@ BENCHMARKS = {"env": "beliefgym.scripts.benchmarks.env:run"}
 class Benchmark:
     """Measure speed against what a user would pick instead; leave the machine alone meanwhile.
 
-    Examples:
+    For example:
+
         beliefgym benchmark env
     """
 

@@ -20,7 +20,8 @@ from beliefgym.scripts.options import TaskOptions, agent_from
 class Evaluate:
     """Mean return and score of a saved agent, or of the random policy or the expert.
 
-    Examples:
+    For example:
+
         beliefgym evaluate runs/PendulumPosition-v0/sac-stack-seed-0.zip --episodes 300
         beliefgym evaluate expert --env beliefgym/CartPoleSwingUp-v0
     """
@@ -59,7 +60,8 @@ class Evaluate:
 class Record:
     """Record videos of a saved agent, or of the random policy or the expert.
 
-    Examples:
+    For example:
+
         beliefgym record runs/PendulumPosition-v0/sac-stack-seed-0.zip --episodes 2
         beliefgym record expert --env beliefgym/CartPoleSwingUp-v0 --out videos/expert
     """

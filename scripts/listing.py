@@ -21,7 +21,8 @@ from beliefgym.wrappers.task import Task
 class Envs:
     """List the environments, or show one's data sheet.
 
-    Examples:
+    For example:
+
         beliefgym envs
         beliefgym envs beliefgym/CartPoleSwingUpPosition-v0
     """

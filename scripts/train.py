@@ -18,7 +18,8 @@ from beliefgym.scripts.training import LearningCurve, git_commit, machine, versi
 class Train:
     """Train an agent on a task, show its learning curve, save it.
 
-    Examples:
+    For example:
+
         beliefgym train --agent sac-stack --env beliefgym/PendulumPosition-v0 --steps 20000
         beliefgym train --agent ppo --noise 0.1 --option n_stack=8 --tensorboard runs/tensorboard
         beliefgym train --agent my_package.agents:MyAgent --env beliefgym/CartPoleSwingUpPosition-v0

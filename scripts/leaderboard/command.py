@@ -17,7 +17,8 @@ from beliefgym.wrappers.task import Task
 class Leaderboard:
     """Train, evaluate and rank agents; what has finished is never run twice.
 
-    Examples:
+    For example:
+
         beliefgym leaderboard
         beliefgym leaderboard --tier full --processes 8
         beliefgym leaderboard --name mine --envs beliefgym/Pendulum-v0 --agents ppo my_package:MyAgent --steps 50000
