@@ -49,7 +49,7 @@ class Pendulum(System):
         integrator: "semi_implicit_euler" or "rk4".
         start_angle: rad. start_speed: rad/s.
 
-    Reference: Gymnasium 1.x, Pendulum-v1; thesis proposal, Sec. 3.1.4.
+    Reference: Gymnasium 1.x, Pendulum-v1; thesis proposal, Sec. 3.1.3.
     """
 
     gravity: float = 10.0

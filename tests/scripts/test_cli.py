@@ -142,9 +142,7 @@ def test_a_checkpoint_for_another_space_is_told(trained, capsys):
 def test_help_has_examples(capsys):
     for command in ("train", "evaluate", "record", "leaderboard", "envs", "benchmark"):
         assert run(command, "--help") == 0
-        assert f"\n    beliefgym {command} " in capsys.readouterr().out.replace(
-            "\n    beliefgym leaderboard\n", "\n"
-        )
+        assert f"\n    beliefgym {command} " in capsys.readouterr().out
 
 
 def test_ctrl_c_keeps_what_was_learned(tmp_path, monkeypatch, capsys):
