@@ -20,6 +20,18 @@ _RECURRENT = {
     },
 }
 
+_PPO_PENDULUM = {
+    "n_steps": 1024,
+    "gae_lambda": 0.95,
+    "gamma": 0.9,
+    "n_epochs": 10,
+    "ent_coef": 0.0,
+    "learning_rate": 1e-3,
+    "clip_range": 0.2,
+    "use_sde": True,
+    "sde_sample_freq": 4,
+}
+
 HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
     "PPO": {
         "": {
@@ -31,15 +43,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
             "n_envs": 4,
             "arguments": {
                 "policy": "MlpPolicy",
-                "n_steps": 1024,
-                "gae_lambda": 0.95,
-                "gamma": 0.9,
-                "n_epochs": 10,
-                "ent_coef": 0.0,
-                "learning_rate": 1e-3,
-                "clip_range": 0.2,
-                "use_sde": True,
-                "sde_sample_freq": 4,
+                **_PPO_PENDULUM,
             },
         },
         "CartPoleSwingUp": {
@@ -87,15 +91,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
             "normalize": True,
             "arguments": {
                 **_RECURRENT,
-                "n_steps": 1024,
-                "gae_lambda": 0.95,
-                "gamma": 0.9,
-                "n_epochs": 10,
-                "ent_coef": 0.0,
-                "learning_rate": 1e-3,
-                "clip_range": 0.2,
-                "use_sde": True,
-                "sde_sample_freq": 4,
+                **_PPO_PENDULUM,
             },
         },
         "CartPoleSwingUp": {
