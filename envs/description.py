@@ -33,7 +33,7 @@ class Described:
     @property
     def hint_names(self) -> tuple[str, ...] | None:
         """Names of the hint's components, if hints were asked for."""
-        return self.system.state_names if self._hint else None
+        return (self.system.hint_names or self.system.state_names) if self._hint else None
 
     @property
     def action_names(self) -> tuple[str, ...]:

@@ -49,7 +49,8 @@ class SystemEnv(Described, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     Args:
         system: a `System`, its class, or "module:Class".
         components: the observation components to show, by name; all by default.
-        hint: put the true state into `info["hint"]` (privileged: for training only).
+        hint: put the privileged quantities of `hint_names` (the true state, unless the system names others) into
+            `info["hint"]`; for training only.
         render_mode: None, "rgb_array" or "human".
         **parameters: the system's parameters by name; an unknown one is an error.
     """
@@ -138,7 +139,7 @@ class SystemEnv(Described, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._window = None
 
     def _info(self) -> dict[str, Any]:
-        return {"hint": self._simulation.state[0].copy()} if self._hint else {}
+        return {"hint": np.array(self.system.hint(self._simulation.state)[0])} if self._hint else {}
 
     def _name_simulation(self) -> None:
         if self.spec is not None:

@@ -57,7 +57,7 @@ class Kernel(Protocol):
         """One control period of every copy.
 
         Args:
-            state: (n, n_state). action: (n, n_action). noise: (n, n_action + n_state) or None.
+            state: (n, n_state). action: (n, n_action). noise: (n, noise_size) or None.
             steps: (n,) steps taken; one is added. limit: steps after which an episode is truncated.
             out: written.
 
@@ -232,7 +232,7 @@ def _traced(
     stepping = Graph()
     state = stepping.symbols("state", system.n_state)
     action = system.clip(stepping.symbols("action", system.n_action))
-    noise = stepping.symbols("noise", system.n_action + system.n_state) if system.noise_size else None
+    noise = stepping.symbols("noise", system.noise_size) if system.noise_size else None
     next_state = system.step(state, action, noise)
     targets = [(f"next_state[i, {j}]", item) for j, item in enumerate(next_state.items)]
     targets.append(("reward[i]", system.reward(state, action, next_state)))

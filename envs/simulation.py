@@ -84,7 +84,7 @@ class Simulation:
             state: start state (n_state,) or (n, n_state) instead of a drawn one.
 
         Raises:
-            ValueError: a start state of the wrong shape or not finite.
+            ValueError: a start state of the wrong shape, not finite or not possible; names the copy.
         """
         if self._streams is None:
             self._streams = RandomStreams(fresh_seeds(len(self)))
@@ -164,7 +164,30 @@ class Simulation:
             )
         if not np.isfinite(array).all():
             raise ValueError(f"{self.name}: expected a finite start state, got {array.tolist()}")
-        return np.broadcast_to(array, self.state.shape)
+        states = np.broadcast_to(array, self.state.shape)
+        self._tell_what_is_impossible(states)
+        return states
+
+    def _tell_what_is_impossible(self, states: NDArray[np.float64]) -> None:
+        system = self.system
+        low, high = system.state_limits
+        for copy, component in np.argwhere((states < low) | (states > high)):
+            raise ValueError(
+                f"{self.name}: impossible start state of copy {copy}: expected {system.state_names[component]!r} "
+                f"within {low[component]:g}..{high[component]:g}, got {states[copy, component]:g}"
+            )
+        for start in system.quaternions:
+            norm = np.sqrt((states[:, start : start + 4] ** 2).sum(axis=1))
+            for copy in np.flatnonzero(np.abs(norm - 1.0) > 1e-6):
+                raise ValueError(
+                    f"{self.name}: impossible start state of copy {copy}: expected a quaternion of norm 1 in "
+                    f"{', '.join(system.state_names[start : start + 4])}, got norm {norm[copy]:g}; divide it by its norm"
+                )
+        for copy in np.flatnonzero(np.asarray(system.terminated(states))):
+            raise ValueError(
+                f"{self.name}: impossible start state of copy {copy}: the episode would already be over there "
+                f"(state: {states[copy].tolist()})"
+            )
 
     def _tell_what_is_wrong(self, state: NDArray[np.float64], action: NDArray[np.float64]) -> None:
         for copy, component in np.argwhere(np.isnan(action)):

@@ -4,10 +4,11 @@ A system is a frozen dataclass whose fields are its physical parameters. Its fun
 no time; they take arrays (..., n) of numpy or torch (the array API), so that one text serves the single
 environment, the batch of thousands of copies, the planner's derivatives and a physics filter:
 
-    s_{t+1} = f(s_t, u_t + sigma_u eps_u) + sigma_s eps_s,     y_t = h(s_t),     r_t = r(s_t, u_t, s_{t+1})
+    s_{t+1} = P(f(s_t, u_t + sigma_u eps_u, sigma_d eps_d) + sigma_s eps_s),   y_t = h(s_t),   r_t = r(s_t, u_t, s_{t+1})
 
-with u_t clipped to the action limits and eps standard normal. To add a system: write one file with one
-subclass, and one line in registration.py.
+with u_t clipped to the action limits, eps standard normal, d the disturbances that a system names (forces of the
+wind, a drifting bias), and P the way back to a possible state (unit quaternions). To add a system: write one file
+with one subclass, and one line in registration.py.
 """
 
 from __future__ import annotations
@@ -50,6 +51,9 @@ class System(ABC):
     state_names: ClassVar[tuple[str, ...]]
     action_names: ClassVar[tuple[str, ...]]
     observation_names: ClassVar[tuple[str, ...]]
+    disturbance_names: ClassVar[tuple[str, ...]] = ()
+    hint_names: ClassVar[tuple[str, ...] | None] = None  # None: the hint is the whole state
+    quaternions: ClassVar[tuple[int, ...]] = ()  # where in the state a unit quaternion begins
 
     def __post_init__(self) -> None:
         if not self.dt > 0:
@@ -76,8 +80,13 @@ class System(ABC):
 
     @property
     def noise_size(self) -> int:
-        """Standard normal numbers that one step takes: actions first, then states; 0 without noise."""
-        return (self.n_action + self.n_state) if np.any(self._noise_scale) else 0
+        """Standard normal numbers that one step takes: those of actions, states, disturbances whose std is not 0."""
+        return int(np.count_nonzero(self._noise_scale))
+
+    @property
+    def disturbance_std(self) -> tuple[float, ...]:
+        """Standard deviation of each disturbance, drawn afresh at every step, in its units."""
+        return ()
 
     @property
     def _noise_scale(self) -> NDArray[np.float64]:
@@ -85,6 +94,7 @@ class System(ABC):
             [
                 np.broadcast_to(np.asarray(self.actuation_noise_std, dtype=float), self.n_action),
                 np.broadcast_to(np.asarray(self.process_noise_std, dtype=float), self.n_state),
+                np.asarray(self.disturbance_std, dtype=float),
             ]
         )
 
@@ -98,17 +108,40 @@ class System(ABC):
     def observation_limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Bounds of the full observation, each (n_observation,); infinite where there is none."""
 
+    @property
+    def state_limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest possible start state, each (n_state,); infinite unless a system says so."""
+        return np.full(self.n_state, -np.inf), np.full(self.n_state, np.inf)
+
     @abstractmethod
-    def flow(self, state: Array, action: Array) -> Array:
+    def flow(self, state: Array, action: Array, disturbance: Array | None = None) -> Array:
         """The state one control period later, without noise and without limits on the action.
 
         Args:
             state: (..., n_state).
             action: (..., n_action).
+            disturbance: (..., n_disturbance) in their units, or None for none; a system that names no disturbances
+                may leave the argument out.
 
         Returns:
             (..., n_state).
         """
+
+    def project(self, state: Array) -> Array:
+        """The possible state nearest to one that noise was added to: quaternions get their unit norm back."""
+        if not self.quaternions:
+            return state
+        xp = array_namespace(state)
+        parts = [state[..., i] for i in range(self.n_state)]
+        for start in self.quaternions:
+            q = parts[start : start + 4]
+            norm = xp.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+            parts[start : start + 4] = [component / norm for component in q]
+        return xp.stack(parts, axis=-1)
+
+    def hint(self, state: Array) -> Array:
+        """What `info["hint"]` holds, (..., n_hint): the state, unless a system names other privileged quantities."""
+        return state
 
     @abstractmethod
     def observe(self, state: Array) -> Array:
@@ -147,7 +180,7 @@ class System(ABC):
         Args:
             state: (..., n_state).
             action: (..., n_action), clipped to its limits here.
-            noise: (..., n_action + n_state) standard normal numbers, or None for none.
+            noise: (..., noise_size) standard normal numbers, or None for none.
 
         Returns:
             (..., n_state).
@@ -155,8 +188,28 @@ class System(ABC):
         action = self.clip(action)
         if noise is None:
             return self.flow(state, action)
-        noise = noise * array_namespace(noise).asarray(self._noise_scale)
-        return self.flow(state, action + noise[..., : self.n_action]) + noise[..., self.n_action :]
+        m, n = self.n_action, self.n_state
+        action_noise = self._noise_part(noise, 0, m)
+        state_noise = self._noise_part(noise, m, m + n)
+        disturbance = self._noise_part(noise, m + n, len(self._noise_scale))
+        if action_noise is not None:
+            action = action + action_noise
+        moved = self.flow(state, action) if disturbance is None else self.flow(state, action, disturbance)
+        return moved if state_noise is None else self.project(moved + state_noise)
+
+    def _noise_part(self, noise: Array, start: int, stop: int) -> Array | None:
+        """Components start..stop of the scaled noise, of which only those whose std is not 0 were drawn."""
+        scale = self._noise_scale
+        if not scale[start:stop].any():
+            return None
+        xp = array_namespace(noise)
+        first = int(np.count_nonzero(scale[:start]))
+        if scale[start:stop].all():
+            return noise[..., first : first + stop - start] * xp.asarray(scale[start:stop])
+        drawn = iter(range(first, self.noise_size))
+        nothing = xp.zeros_like(noise[..., 0])
+        parts = [noise[..., next(drawn)] * float(std) if std else nothing for std in scale[start:stop]]
+        return xp.stack(parts, axis=-1)
 
     def expert(self) -> Any:
         """A controller that knows the true model and the full state; see planning/.

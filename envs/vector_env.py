@@ -34,7 +34,7 @@ class SystemVectorEnv(Described, VectorEnv[NDArray[np.float32], NDArray[np.float
         num_envs: number of copies.
         max_episode_steps: steps after which an episode is truncated; None for no limit.
         components: the observation components to show, by name; all by default.
-        hint: put the true states (n, n_state) into `infos["hint"]` (privileged: for training only).
+        hint: put the privileged quantities of `hint_names` (n, n_hint) into `infos["hint"]`; for training only.
         autoreset_mode: an `AutoresetMode` or its name; Gymnasium's default NEXT_STEP by default.
         render_mode: None or "rgb_array" (`render()` then gives one picture a copy).
         **parameters: the system's parameters by name; an unknown one is an error.
@@ -189,7 +189,8 @@ class SystemVectorEnv(Described, VectorEnv[NDArray[np.float32], NDArray[np.float
     def _infos(self) -> dict[str, Any]:
         if not self._hint:
             return {}
-        return {"hint": self._simulation.state.copy(), "_hint": np.ones(self.num_envs, dtype=np.bool_)}
+        hint = np.array(self.system.hint(self._simulation.state))
+        return {"hint": hint, "_hint": np.ones(self.num_envs, dtype=np.bool_)}
 
     def _final_infos(self, final_state: NDArray[np.float64], done: NDArray[np.bool_]) -> dict[str, Any]:
         final_observations = np.full(self.num_envs, None, dtype=object)
@@ -198,7 +199,7 @@ class SystemVectorEnv(Described, VectorEnv[NDArray[np.float32], NDArray[np.float
             final_observations[row] = observation
         final_info: dict[str, Any] = {"state": final_state, "_state": done}
         if self._hint:
-            final_info |= {"hint": final_state.copy(), "_hint": done}
+            final_info |= {"hint": np.array(self.system.hint(final_state)), "_hint": done}
         return self._infos() | {
             "final_obs": final_observations,
             "_final_obs": done,
