@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import beliefgym.wrappers as single_wrappers
 import beliefgym.wrappers.vector as vector_wrappers
-from beliefgym.envs.registration import NAMESPACE, VECTOR_ENTRY_POINT
+from beliefgym.envs.registration import NAMESPACE, has_native_vector_form
 
 NAMES = ("PartialObservation", "ObservationNoise", "ObservationDelay", "ActionHistory", "DiscreteActions")
 
@@ -70,7 +70,7 @@ class Task:
         self, num_envs: int, autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP, native: bool = True
     ) -> VectorEnv[Any, Any, Any]:
         """The vector environment: native where a system has one (and `native`), else Gymnasium's SyncVectorEnv."""
-        if native and gym.spec(self.env_id).vector_entry_point == VECTOR_ENTRY_POINT:
+        if native and has_native_vector_form(self.env_id):
             env: VectorEnv[Any, Any, Any] = gym.make_vec(
                 self.env_id,
                 num_envs=num_envs,
