@@ -103,7 +103,7 @@ class CartPole(System):
         theta_acceleration = (total * (g * s - f * w) - push * c) / (length * d)
         return xp.stack([velocity, x_acceleration, w, theta_acceleration], axis=-1)
 
-    def flow(self, state: Array, action: Array) -> Array:
+    def flow(self, state: Array, action: Array, disturbance: Array | None = None) -> Array:
         """See `System.flow`."""
         return rk4(self.derivative, state, action, self.dt)
 

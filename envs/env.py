@@ -84,6 +84,10 @@ class SystemEnv(Described, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """(n_state,) the true state."""
         return self._simulation.state[0].copy()
 
+    def expert(self) -> Any:
+        """The controller of `System.expert`."""
+        return self.system.expert()
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:

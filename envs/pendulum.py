@@ -108,7 +108,7 @@ class Pendulum(System):
         acceleration = acceleration + torque * (1.0 / moment)
         return acceleration - self.damping * speed if self.damping else acceleration
 
-    def flow(self, state: Array, action: Array) -> Array:
+    def flow(self, state: Array, action: Array, disturbance: Array | None = None) -> Array:
         """See `System.flow`."""
         xp = array_namespace(state)
         if self.integrator == "rk4":

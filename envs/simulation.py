@@ -181,7 +181,8 @@ class Simulation:
             for copy in np.flatnonzero(np.abs(norm - 1.0) > 1e-6):
                 raise ValueError(
                     f"{self.name}: impossible start state of copy {copy}: expected a quaternion of norm 1 in "
-                    f"{', '.join(system.state_names[start : start + 4])}, got norm {norm[copy]:g}; divide it by its norm"
+                    f"{', '.join(system.state_names[start : start + 4])}, got norm {norm[copy]:g}; divide it by "
+                    "its norm"
                 )
         for copy in np.flatnonzero(np.asarray(system.terminated(states))):
             raise ValueError(

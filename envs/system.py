@@ -4,7 +4,8 @@ A system is a frozen dataclass whose fields are its physical parameters. Its fun
 no time; they take arrays (..., n) of numpy or torch (the array API), so that one text serves the single
 environment, the batch of thousands of copies, the planner's derivatives and a physics filter:
 
-    s_{t+1} = P(f(s_t, u_t + sigma_u eps_u, sigma_d eps_d) + sigma_s eps_s),   y_t = h(s_t),   r_t = r(s_t, u_t, s_{t+1})
+    s_{t+1} = P(f(s_t, u_t + sigma_u eps_u, sigma_d eps_d) + sigma_s eps_s)
+    y_t = h(s_t),     r_t = r(s_t, u_t, s_{t+1})
 
 with u_t clipped to the action limits, eps standard normal, d the disturbances that a system names (forces of the
 wind, a drifting bias), and P the way back to a possible state (unit quaternions). To add a system: write one file

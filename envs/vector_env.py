@@ -96,6 +96,10 @@ class SystemVectorEnv(Described, VectorEnv[NDArray[np.float32], NDArray[np.float
         """When finished copies start anew (TorchRL asks for it by this name, as SyncVectorEnv has it)."""
         return self._mode
 
+    def expert(self) -> Any:
+        """The controller of `System.expert`."""
+        return self.system.expert()
+
     def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
