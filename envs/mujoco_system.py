@@ -71,7 +71,7 @@ class MujocoSystem(System):
                 "use transition_derivatives(state, action) for its linearisation, or detach() the state and action"
             )
         moved = self.advance(to_numpy(state), to_numpy(action))
-        return xp.asarray(moved, **({"device": state.device} if is_torch_array(state) else {}))
+        return xp.asarray(moved, dtype=state.dtype, device=state.device)
 
     @abstractmethod
     def advance(self, state: Floats, action: Floats) -> Floats:

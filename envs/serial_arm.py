@@ -121,25 +121,17 @@ def mjcf(
     )
     ElementTree.SubElement(option, "flag", contact="disable")
     world = ElementTree.SubElement(root, "worldbody")
-    parent = ElementTree.SubElement(world, "body", name="base", pos=_numbers(base_xyz), **_turn(base_rpy))
+    parent = _body(world, "base", base_xyz, base_rpy)
     for item in links:
-        parent = ElementTree.SubElement(
-            parent, "body", name=item.link, pos=_numbers(item.xyz), **_turn(item.rpy)
-        )
+        parent = _body(parent, item.link, item.xyz, item.rpy)
         limits = {} if math.isinf(item.high) else {"range": _numbers((item.low, item.high))}
+        joint = {"name": item.joint, "type": "hinge", "axis": "0 0 1"}
         ElementTree.SubElement(
-            parent,
-            "joint",
-            name=item.joint,
-            type="hinge",
-            axis="0 0 1",
-            damping=repr(damping),
-            armature=repr(armature),
-            **limits,
+            parent, "joint", {**joint, "damping": repr(damping), "armature": repr(armature), **limits}
         )
         _inertial(parent, item.mass, item.com, item.inertia)
         _capsules(parent, item.shape)
-    hand = ElementTree.SubElement(parent, "body", name="hand", pos=_numbers(tip.xyz), **_turn(tip.rpy))
+    hand = _body(parent, "hand", tip.xyz, tip.rpy)
     if tip.mass:
         _inertial(hand, tip.mass, tip.com, tip.inertia)
     _capsules(hand, tip.shape)
@@ -177,10 +169,11 @@ def _capsules(body: ElementTree.Element, shape: Sequence[tuple[Vector3, Vector3,
         )
 
 
-def _turn(rpy: Vector3) -> dict[str, str]:
-    """The orientation attribute of a body: the columns x and y of its frame."""
+def _body(parent: ElementTree.Element, name: str, xyz: Vector3, rpy: Vector3) -> ElementTree.Element:
+    """A body whose frame is given by its x and y axes."""
     matrix = rotation(rpy)
-    return {"xyaxes": _numbers((*matrix[:, 0], *matrix[:, 1]))}
+    axes = _numbers((*matrix[:, 0], *matrix[:, 1]))
+    return ElementTree.SubElement(parent, "body", name=name, pos=_numbers(xyz), xyaxes=axes)
 
 
 def _numbers(values: Sequence[float]) -> str:

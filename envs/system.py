@@ -161,7 +161,7 @@ class System(ABC):
     def terminated(self, state: Array) -> Array:
         """Where the task ends for good, bool (...); nowhere unless a system says so."""
         xp = array_namespace(state)
-        return xp.zeros(state.shape[:-1], dtype=xp.bool)
+        return xp.zeros(state.shape[:-1], dtype=xp.bool, device=state.device)
 
     def stage_cost(self, state: Array, action: Array) -> Array:
         """What planners minimise, (...); the negative reward unless a system names a smoother one."""
@@ -173,7 +173,7 @@ class System(ABC):
         low, high = self.action_limits
         if xp.__name__.endswith("numpy"):
             return np.minimum(np.maximum(action, low), high)
-        return xp.minimum(xp.maximum(action, xp.asarray(low)), xp.asarray(high))
+        return xp.minimum(xp.maximum(action, constant(low, action)), constant(high, action))
 
     def step(self, state: Array, action: Array, noise: Array | None = None) -> Array:
         """One control period with limits and noise.
@@ -206,7 +206,7 @@ class System(ABC):
         xp = array_namespace(noise)
         first = int(np.count_nonzero(scale[:start]))
         if scale[start:stop].all():
-            return noise[..., first : first + stop - start] * xp.asarray(scale[start:stop])
+            return noise[..., first : first + stop - start] * constant(scale[start:stop], noise)
         drawn = iter(range(first, self.noise_size))
         nothing = xp.zeros_like(noise[..., 0])
         parts = [noise[..., next(drawn)] * float(std) if std else nothing for std in scale[start:stop]]
@@ -224,6 +224,11 @@ class System(ABC):
     def draw(self, canvas: Canvas, state: NDArray[np.float64], action: NDArray[np.float64] | None) -> None:
         """Draw one state (n_state,) and the last action (n_action,) on a canvas."""
         raise ValueError(f"{type(self).__name__} has no picture; override System.draw to give it one")
+
+
+def constant(values: NDArray[np.float64], like: Array) -> Array:
+    """Numbers (k,) as an array of the namespace, type and device of another."""
+    return array_namespace(like).asarray(values, dtype=like.dtype, device=like.device)
 
 
 def wrap_angle(angle: Array) -> Array:

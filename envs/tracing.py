@@ -53,6 +53,8 @@ def _binary(operation: str, swap: bool = False) -> Callable[[Any, Any], Any]:
 
 class _Symbolic:
     graph: Graph
+    dtype: ClassVar[Any] = np.float64
+    device: ClassVar[str] = "cpu"
     __add__, __radd__ = _binary("+"), _binary("+", swap=True)
     __sub__, __rsub__ = _binary("-"), _binary("-", swap=True)
     __mul__, __rmul__ = _binary("*"), _binary("*", swap=True)
@@ -163,11 +165,11 @@ class Namespace:
             f"{name}() cannot be traced (what can: {', '.join(_FUNCTIONS)}, stack, asarray, zeros, clip)"
         )
 
-    def asarray(self, value: Any, dtype: Any = None) -> Any:
+    def asarray(self, value: Any, dtype: Any = None, device: Any = None) -> Any:
         """A number or a vector of numbers as constants."""
         return _as_symbol(self._graph, value)
 
-    def zeros(self, shape: tuple[int, ...], dtype: Any = float) -> Any:
+    def zeros(self, shape: tuple[int, ...], dtype: Any = float, device: Any = None) -> Any:
         """Zeros of shape () or (k,)."""
         return self._filled(shape, dtype(0))
 
