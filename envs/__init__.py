@@ -1,6 +1,7 @@
 """Physical systems, their Gymnasium environments and registration."""
 
 from beliefgym.envs.cart_pole import CartPole
+from beliefgym.envs.cart_pole_balance import CartPoleBalance
 from beliefgym.envs.collect import collect
 from beliefgym.envs.env import SystemEnv
 from beliefgym.envs.pendulum import Pendulum
@@ -11,6 +12,7 @@ from beliefgym.envs.vector_env import SystemVectorEnv
 
 __all__ = [
     "CartPole",
+    "CartPoleBalance",
     "NonFiniteError",
     "Pendulum",
     "System",

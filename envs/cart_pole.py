@@ -149,17 +149,24 @@ class CartPole(System):
 
     def draw(self, canvas: Canvas, state: NDArray[np.float64], action: NDArray[np.float64] | None) -> None:
         """Track with its ends, cart, pole, and an arrow for the force."""
-        x, theta, length = float(state[0]), float(state[2]), self.length
-        canvas.view(center=(0.0, 0.1 * length), width=2.0 * self.track + 1.2)
-        canvas.line((-self.track, 0.0), (self.track, 0.0), 0.03, "guide")
-        for end in (-self.track, self.track):
-            canvas.line((end, -0.12), (end, 0.12), 0.03, "guide")
-        if action is not None:
-            canvas.arrow((x, 0.0), (x + 0.9 * float(action[0]) / self.max_force, 0.0), 0.05, "force")
-        canvas.box((x, 0.0), 0.5, 0.26, "joint")
-        tip = (x + length * np.sin(theta), length * np.cos(theta))
-        canvas.rod((x, 0.0), tip, 0.09, "body")
-        canvas.circle(tip, 0.08, "body")
+        force = None if action is None else float(action[0]) / self.max_force
+        draw_cart_pole(canvas, float(state[0]), float(state[2]), self.length, self.track, force)
+
+
+def draw_cart_pole(
+    canvas: Canvas, x: float, theta: float, length: float, track: float, force: float | None
+) -> None:
+    """A cart at x (m) with a pole of a length (m) at theta (rad, 0 up), and its force as a share of the largest."""
+    canvas.view(center=(0.0, 0.1 * length), width=2.0 * track + 1.2)
+    canvas.line((-track, 0.0), (track, 0.0), 0.03, "guide")
+    for end in (-track, track):
+        canvas.line((end, -0.12), (end, 0.12), 0.03, "guide")
+    if force is not None:
+        canvas.arrow((x, 0.0), (x + 0.9 * force, 0.0), 0.05, "force")
+    canvas.box((x, 0.0), 0.5, 0.26, "joint")
+    tip = (x + length * np.sin(theta), length * np.cos(theta))
+    canvas.rod((x, 0.0), tip, 0.09, "body")
+    canvas.circle(tip, 0.08, "body")
 
 
 _LN10 = float(np.log(10.0))

@@ -118,3 +118,21 @@ def register_all() -> None:
         max_episode_steps=200,
         partial={"Position": ("x", "cos_theta", "sin_theta")},
     )
+    _register_cart_pole_classics()
+
+
+def _register_cart_pole_classics() -> None:
+    """CartPole as the suites of hidden-state tasks have it: full, positions only, and positions with noise."""
+    push = ("DiscreteActions", {"bins": 2})
+    hide = ("PartialObservation", {"keep": ["x", "theta"]})
+    system = "beliefgym.envs.cart_pole_balance:CartPoleBalance"
+    for suffix, layers in {"": [push], "Position": [hide, push]}.items():
+        register_composed(f"CartPoleBalance{suffix}", system=system, layers=layers, max_episode_steps=500)
+    for level, std in {"Easy": 0.1, "Medium": 0.2, "Hard": 0.3}.items():
+        register_composed(
+            f"CartPoleBalanceNoisy{level}",
+            system=system,
+            layers=[hide, ("ObservationNoise", {"std": std}), push],
+            exposes={"noise": ("ObservationNoise", "std")},
+            max_episode_steps=200,
+        )

@@ -157,28 +157,42 @@ def _panel(
     system: System, state: NDArray[np.float64], action: NDArray[np.float64] | None, shown: Sequence[str]
 ) -> NDArray[np.uint8]:
     """Names and values: of the observation (hidden components faint and without value), and of the action."""
+    values = np.asarray(system.observe(state))
+    seen = [
+        (name, f"{value:.2f}" if name in shown else "hidden", "text" if name in shown else "faint")
+        for name, value in zip(system.observation_names, values, strict=True)
+    ]
+    done = [
+        (name, "-" if action is None else f"{action[i]:.2f}", "force")
+        for i, name in enumerate(system.action_names)
+    ]
+    return panel(type(system).__name__, seen, done)
+
+
+def panel(
+    title: str, seen: Sequence[tuple[str, str, str]], done: Sequence[tuple[str, str, str]]
+) -> NDArray[np.uint8]:
+    """The side panel: rows (name, value, color) of the observation and of the action, as small as they must be.
+
+    Returns:
+        (480, 240, 3) uint8.
+    """
     import pygame
 
     surface = pygame.Surface((PANEL, SIZE))
     surface.fill(COLORS["panel"])
-    y = _text(surface, type(system).__name__, 16, 18, 22, "text")
-    y = _text(surface, "the agent sees", 16, y + 14, 15, "faint")
-    values = np.asarray(system.observe(state))
-    for name, value in zip(system.observation_names, values, strict=True):
-        visible = name in shown
-        _text(
-            surface,
-            f"{value:.2f}" if visible else "hidden",
-            PANEL - 70,
-            y + 4,
-            17,
-            "text" if visible else "faint",
-        )
-        y = _text(surface, name.replace("_", " "), 16, y + 4, 17, "text" if visible else "faint")
-    y = _text(surface, "action", 16, y + 16, 15, "faint")
-    for i, name in enumerate(system.action_names):
-        _text(surface, "-" if action is None else f"{action[i]:.2f}", PANEL - 70, y + 4, 17, "force")
-        y = _text(surface, name.replace("_", " "), 16, y + 4, 17, "force")
+    y = _text(surface, title, 16, 18, 22, "text")
+    rows = len(seen) + len(done)
+    pitch = min(21.0, (SIZE - y - 90.0) / max(rows, 1))
+    size = max(6, round(0.8 * pitch))
+    for heading, lines in (("the agent sees", seen), ("action", done)):
+        y = _text(surface, heading, 16, y + 14, 15, "faint") + 4
+        top = float(y)
+        for name, value, color in lines:
+            _text(surface, value, PANEL - 70, round(top), size, color)
+            _text(surface, name.replace("_", " "), 16, round(top), size, color)
+            top += pitch
+        y = round(top)
     return np.ascontiguousarray(pygame.surfarray.array3d(surface).transpose(1, 0, 2))
 
 

@@ -27,6 +27,4 @@ def torchrl_env(task: Task | str, num_envs: int | None = None, device: Any = "cp
 
     task = task if isinstance(task, Task) else Task(task)
     env: Any = task.make() if num_envs is None else task.make_vec(num_envs, AutoresetMode.SAME_STEP)
-    if num_envs is not None and not hasattr(env, "autoreset_mode"):
-        env.autoreset_mode = env.metadata["autoreset_mode"]  # where TorchRL looks; vector wrappers lack it
     return GymWrapper(env, device=device)

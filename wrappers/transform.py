@@ -180,6 +180,11 @@ class VectorTransformObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         """The name of each component of one copy's observation."""
         return self.transform.observation_names
 
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """When finished copies start anew, under the name by which TorchRL asks for it."""
+        return self._mode
+
     def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[Any], dict[str, Any]]:

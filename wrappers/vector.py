@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import VectorActionWrapper, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
@@ -106,6 +106,12 @@ class DiscreteActions(VectorActionWrapper[Any, Any, Any, Any]):
         self._grid = ActionGrid(env.single_action_space, bins, space)
         self.single_action_space = self._grid.action_space
         self.action_space = batch_space(self.single_action_space, env.num_envs)
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """When finished copies start anew, under the name by which TorchRL asks for it."""
+        mode: AutoresetMode = self.metadata["autoreset_mode"]
+        return mode
 
     def actions(self, actions: Any) -> NDArray[Any]:
         """(n,) or (n, n_act) numbers of grid points -> (n, n_act) actions."""
