@@ -1,7 +1,8 @@
 """`beliefgym benchmark env`: steps per second of the environments, and of SB3 fed from them.
 
 The native vector environment of the pendulum against Gymnasium's SyncVectorEnv and AsyncVectorEnv on Pendulum-v1
-(the same physics) and against EnvPool's Pendulum where it is installed; then SB3's `collect_rollouts` and PPO from
+(the same physics) and against EnvPool's Pendulum where it is installed; every other environment against its nearest
+peer, and the systems as torch batches (every_env.py); then SB3's `collect_rollouts` and PPO from
 end to end, through `SB3VecEnv` against SB3's own `make_vec_env`.
 """
 
@@ -19,6 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from beliefgym.scripts.benchmarks.every_env import every_environment, torch_batches
 from beliefgym.scripts.benchmarks.measuring import rates, row
 from beliefgym.wrappers.sb3 import SB3VecEnv
 
@@ -46,6 +48,8 @@ def run(told: Callable[[str], None]) -> tuple[list[dict[str, Any]], dict[str, An
     for n in COPIES:
         told(f"pendulum, {n} copies")
         rows += _steps(n, limits)
+    rows += every_environment(told)
+    rows += torch_batches(told)
     told(f"SB3 collect_rollouts, {SB3_COPIES} environments")
     rows += _collecting()
     told("PPO from end to end")
