@@ -1,5 +1,6 @@
-"""The expert: a planner that knows the true model and reads the true state. The one of every leaderboard score.
+"""The expert: it reads the true state, and its return is the one of every leaderboard score.
 
+For a beliefgym system it is a planner that knows the true model; for the locomotion tasks a trained full-state policy.
 It does not play by the agents' rules (it sees the full state of a partially observed task), so it is a reference,
 not a competitor.
 """
@@ -16,37 +17,36 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from beliefgym.agents.agent import Agent, episode_starts
-from beliefgym.envs.system import System
 from beliefgym.wrappers import DiscreteActions
 from beliefgym.wrappers.task import Task
 
 
 class Expert(Agent):
-    """The expert controller of a task's system, in SB3's face.
+    """The expert controller of a task, in SB3's face: what `expert()` of its unwrapped environment returns.
 
     It must know the environment it acts in, because an observation does not hold the state: call
     `set_env(env)` with the single, vector or SB3 vector environment first (`evaluate` does).
 
     Args:
-        task: a task on a beliefgym system.
+        task: a task whose unwrapped environment offers `state` and `expert()`, a controller with `act(state, restart)`.
         seed: not used; the expert is deterministic.
 
     Raises:
-        ValueError: the environment is not made from a `System`.
+        ValueError: the environment has no expert.
     """
 
     def __init__(self, task: Task | str, seed: int = 0) -> None:
         super().__init__(task, seed)
-        env = self.task.make_vec(1)
-        system = getattr(env.unwrapped, "system", None)
-        env.close()
-        if not isinstance(system, System):
+        env = self.task.make()
+        make_controller = getattr(env.unwrapped, "expert", None)
+        if not callable(make_controller) or not hasattr(env.unwrapped, "state"):
             raise ValueError(
-                f"{self.task.env_id} has no expert: it is not made from a beliefgym System; "
-                "`beliefgym envs` marks those that have one"
+                f"{self.task.env_id} has no expert: its environment does not offer expert() and state; "
+                "`beliefgym envs` lists those that do"
             )
-        self.system = system
-        self._controller = system.expert()
+        self.system = getattr(env.unwrapped, "system", None)  # None for the locomotion tasks
+        self._controller: Any = make_controller()
+        env.close()
         self._env: Any = None
         self._table: NDArray[np.float64] | None = None
 
@@ -93,9 +93,10 @@ class Expert(Agent):
     def _true_state(self) -> NDArray[np.float64]:
         if isinstance(self._env, gym.Env):
             return np.asarray(self._env.unwrapped.state)[None]  # type: ignore[attr-defined]
-        if isinstance(self._env, VectorEnv):
-            return np.asarray(self._env.unwrapped.state)  # type: ignore[attr-defined]
-        return np.stack(self._env.get_attr("state"))
+        if isinstance(self._env, VectorEnv) and hasattr(self._env.unwrapped, "state"):
+            return np.asarray(self._env.unwrapped.state)
+        env: Any = self._env.unwrapped if isinstance(self._env, VectorEnv) else self._env
+        return np.stack(env.get_attr("state"))  # of SB3, or of Gymnasium's SyncVectorEnv and AsyncVectorEnv
 
     def _in_action_space(self, action: NDArray[np.float64], single: bool) -> NDArray[Any]:
         chosen: NDArray[Any] = action.astype(np.float32)

@@ -4,7 +4,8 @@ The pendulum's are those that rl-zoo3 publishes: PPO and SAC for Pendulum-v1, re
 pendulum (SAC on 4 environments with as many gradient steps, which is our change). The cart-pole's were chosen here on
 validation seeds, with stacked frames and position only: PPO among 5 settings on training seeds 0 and 1, SAC among 2 on
 seed 0. Recurrent PPO on the cart-pole takes PPO's settings and was not tuned on its own, and neither were the agents
-without memory, so their scores there are lower bounds. A key is the start of an environment's name; "" is for every
+without memory, so their scores there are lower bounds. Every other environment with continuous actions has one and the
+same untuned setting of PPO. A key is the start of an environment's name; "" is for every
 other environment. An agent with stacked frames takes the settings of the one without.
 """
 
@@ -35,6 +36,26 @@ _PPO_PENDULUM = {
     "sde_sample_freq": 4,
 }
 
+# one setting for every environment with several continuous actions, chosen before any of them was run
+_PPO_CONTROL = {
+    "n_envs": 16,
+    "normalize": True,
+    "rescale_actions": True,
+    "arguments": {
+        "policy": "MlpPolicy",
+        "n_steps": 256,
+        "batch_size": 512,
+        "n_epochs": 10,
+        "gae_lambda": 0.95,
+        "gamma": 0.99,
+        "learning_rate": "linear:1e-3",
+    },
+}
+_CONTROL = (
+    *("Helicopter", "Quadrotor", "MobileBase", "Baxter", "Mico", "DoublePendulum"),
+    *("Hopper", "Walker2d", "HalfCheetah", "Swimmer", "InvertedPendulum"),
+)
+
 HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
     "PPO": {
         "": {
@@ -63,6 +84,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
                 "learning_rate": 1e-3,
             },
         },
+        **dict.fromkeys(_CONTROL, _PPO_CONTROL),
     },
     "SAC": {
         "": {"n_envs": 1, "arguments": {"policy": "MlpPolicy", "buffer_size": 300_000}},

@@ -17,6 +17,7 @@ from typing import Any
 import beliefgym.envs
 from beliefgym.agents.evaluation import evaluate
 from beliefgym.agents.registry import make_agent
+from beliefgym.envs import registered_ids
 from beliefgym.wrappers.task import Task
 
 PATH = Path(beliefgym.envs.__file__).with_name("references.json")
@@ -79,12 +80,14 @@ def measure(task: Task | str, n_episodes: int = N_EPISODES) -> References:
 
 
 def measure_all(env_ids: Iterable[str], path: Path = PATH, told: Callable[[str], None] = print) -> None:
-    """Measure the references of the given environments and write the table."""
-    table = {}
+    """Measure the references of the given environments and write the table; what it says of others stays."""
+    kept = json.loads(path.read_text())["references"] if path.exists() else {}
+    table = {env_id: kept[env_id] for env_id in registered_ids() if env_id in kept}
     for env_id in env_ids:
         found = measure(env_id)
         told(f"{env_id}: random {found.random:.1f}, expert {found.expert:.1f}")
         table[env_id] = {name: round(value, 4) for name, value in vars(found).items()}
+    table = dict(sorted(table.items()))
     temporary = path.with_suffix(".tmp")
     temporary.write_text(
         json.dumps({"n_episodes": N_EPISODES, "seed": SEED, "references": table}, indent=1) + "\n"

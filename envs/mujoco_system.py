@@ -82,49 +82,75 @@ class MujocoSystem(System):
 
         Args:
             motion: (..., nq + nv) joint positions and velocities, in rad or m and per s.
-            control: (..., nu) of the actuators, held over the period.
+            control: (..., nu) of the actuators, held over the period; or (..., substeps, nu), one for each substep.
             models: one model for each row (all of one structure) instead of `model`.
 
         Returns:
-            (..., nq + nv).
+            (..., nq + nv); NaN in the rows where MuJoCo diverged.
+        """
+        return self.simulate_and_sense(motion, control, models)[0]
+
+    def simulate_and_sense(
+        self, motion: Floats, control: Floats, models: Sequence[Any] | None = None
+    ) -> tuple[Floats, Floats]:
+        """As `simulate`, with what the model's sensors measured in the last substep.
+
+        Returns:
+            motion (..., nq + nv) and sensor data (..., nsensordata); NaN in the rows where MuJoCo diverged, or
+            where the motion or control were not finite.
         """
         rows = np.ascontiguousarray(motion, dtype=np.float64).reshape(-1, motion.shape[-1])
-        controls = np.ascontiguousarray(control, dtype=np.float64).reshape(len(rows), 1, -1)
-        if not len(rows):
-            return np.array(motion, dtype=np.float64)
         model = self.model
+        lead = motion.shape[:-1]
+        if not len(rows):
+            return np.array(motion, dtype=np.float64), np.zeros((*lead, model.nsensordata))
+        n_controls = self.substeps if np.ndim(control) > motion.ndim else 1
+        controls = np.ascontiguousarray(control, dtype=np.float64).reshape(len(rows), n_controls, model.nu)
+        # MuJoCo takes a control that is not a number for 0, and logs what it finds bad: such rows do not reach it
+        good = (np.abs(rows) < HUGE).all(axis=1) & (np.abs(controls) < HUGE).all(axis=(1, 2))
+        if not good.all():
+            rows = np.where(good[:, None], rows, 0.0)
+            controls = np.where(good[:, None, None], controls, 0.0)
         with_time = np.concatenate([np.zeros((len(rows), 1)), rows], axis=1)
         n_threads = min(_n_threads(), max(1, len(rows) // ROWS_PER_THREAD))
-        states, _ = _pool(n_threads, os.getpid()).rollout(
+        states, sensed = _pool(n_threads, os.getpid()).rollout(
             models if models is not None else model,
             _workspaces(self, n_threads, os.getpid()),
             with_time,
             controls,
             nstep=self.substeps,
         )
-        moved: Floats = states[:, -1, 1:].reshape(motion.shape)
-        return moved
+        end, sensed = states[:, -1], sensed[:, -1]
+        # a rollout that diverges stops there, and gives a state from before that may be finite
+        good &= (end[:, 0] > (self.substeps - 0.5) * model.opt.timestep) & (np.abs(end) < HUGE).all(axis=1)
+        end[~good] = sensed[~good] = np.nan
+        return end[:, 1:].reshape(motion.shape), sensed.reshape(*lead, model.nsensordata)
 
-    def transition_derivatives(self, motion: ArrayLike, control: ArrayLike) -> tuple[Floats, Floats]:
+    def transition_derivatives(
+        self, motion: ArrayLike, control: ArrayLike, model: Any = None
+    ) -> tuple[Floats, Floats]:
         """MuJoCo's own linearisation of one control period, by finite differences (`mjd_transitionFD`).
 
             d motion' = A d motion + B d control,     A = product of the substeps' A_i
 
         Args:
-            motion: (nq + nv,) one state. control: (nu,).
+            motion: (nq + nv,) one state.
+            control: (nu,), or (substeps, nu); d control is the same in each substep.
+            model: instead of the system's own.
 
         Returns:
             A (nq + nv, nq + nv) and B (nq + nv, nu).
         """
-        model = self.model
+        model = self.model if model is None else model
         data = mujoco.MjData(model)
         motion = np.asarray(motion, dtype=np.float64)
         data.qpos[:], data.qvel[:] = motion[: model.nq], motion[model.nq :]
-        data.ctrl[:] = control
         n, m = 2 * model.nv, model.nu
+        controls = np.broadcast_to(np.asarray(control, dtype=np.float64), (self.substeps, m))
         total_a, total_b = np.eye(n), np.zeros((n, m))
         a, b = np.zeros((n, n)), np.zeros((n, m))
-        for _ in range(self.substeps):
+        for row in controls:
+            data.ctrl[:] = row
             mujoco.mjd_transitionFD(model, data, 1e-6, True, a, b, None, None)
             total_a, total_b = a @ total_a, a @ total_b + b
             mujoco.mj_step(model, data)
@@ -132,6 +158,7 @@ class MujocoSystem(System):
 
 
 ROWS_PER_THREAD = 8  # fewer rows than this are not worth waking a thread
+HUGE = 1e10  # MuJoCo's own mark of a number gone bad (mjMAXVAL)
 
 
 def to_numpy(array: Array) -> Floats:

@@ -13,11 +13,12 @@ Reference: Diebel 2006, "Representing Attitude: Euler Angles, Unit Quaternions, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace
+from numpy.typing import NDArray
 
 Array = Any  # an array (...) of any namespace of the array API
 Vector = tuple[Array, Array, Array]
@@ -26,7 +27,7 @@ Quaternion = tuple[Array, Array, Array, Array]
 _SMALL = 1e-4  # rad^2: below it the three terms of the series are exact to 2e-17
 
 
-def product(p: Sequence[Array], q: Sequence[Array]) -> Quaternion:
+def product(p: Iterable[Array], q: Iterable[Array]) -> Quaternion:
     """Hamilton's product p q.
 
         vec(p q) = w_p vec(q) + w_q vec(p) + vec(p) x vec(q),      w = w_p w_q - vec(p) . vec(q)
@@ -47,13 +48,13 @@ def product(p: Sequence[Array], q: Sequence[Array]) -> Quaternion:
     )
 
 
-def conjugate(q: Sequence[Array]) -> Quaternion:
+def conjugate(q: Iterable[Array]) -> Quaternion:
     """The inverse turn: (-x, -y, -z, w)."""
     x, y, z, w = q
     return -x, -y, -z, w
 
 
-def rotate(q: Sequence[Array], v: Sequence[Array]) -> Vector:
+def rotate(q: Iterable[Array], v: Iterable[Array]) -> Vector:
     """A vector in body axes as seen in world axes.
 
         v' = v + w t + vec(q) x t,      t = 2 vec(q) x v
@@ -74,12 +75,12 @@ def rotate(q: Sequence[Array], v: Sequence[Array]) -> Vector:
     )
 
 
-def rotate_inverse(q: Sequence[Array], v: Sequence[Array]) -> Vector:
+def rotate_inverse(q: Iterable[Array], v: Iterable[Array]) -> Vector:
     """A vector in world axes as seen in body axes: `rotate` by the inverse turn."""
     return rotate(conjugate(q), v)
 
 
-def exponential(turn: Sequence[Array]) -> Quaternion:
+def exponential(turn: Iterable[Array]) -> Quaternion:
     """The quaternion of a turn by |a| about a, as body rates times a time step give it.
 
         [a sin(|a|/2) / |a|; cos(|a|/2)],      near 0 by their series in |a|^2, so that derivatives exist there
@@ -102,14 +103,14 @@ def exponential(turn: Sequence[Array]) -> Quaternion:
     return scale * a, scale * b, scale * c, w
 
 
-def normalise(q: Sequence[Array]) -> Quaternion:
+def normalise(q: Iterable[Array]) -> Quaternion:
     """The unit quaternion of the same direction; q must not be 0."""
     x, y, z, w = q
     shrink = 1.0 / array_namespace(x).sqrt(x * x + y * y + z * z + w * w)
     return x * shrink, y * shrink, z * shrink, w * shrink
 
 
-def integrate(q: Sequence[Array], rates: Sequence[Array], dt: float) -> Quaternion:
+def integrate(q: Iterable[Array], rates: Iterable[Array], dt: float) -> Quaternion:
     """The attitude after dt at constant body rates, with unit norm: q exp(rates dt).
 
     Args:
@@ -122,7 +123,7 @@ def integrate(q: Sequence[Array], rates: Sequence[Array], dt: float) -> Quaterni
     return normalise(product(q, exponential((dt * a, dt * b, dt * c))))
 
 
-def euler_angles(q: Sequence[Array]) -> Vector:
+def euler_angles(q: Iterable[Array]) -> Vector:
     """Roll, pitch and yaw (z-y'-x'' order: yaw first), rad; roll and yaw in -pi..pi, pitch in -pi/2..pi/2.
 
     The pitch is atan2(s, sqrt(1 - s^2)) with s = 2 (w y - z x) held within -1..1.
@@ -147,13 +148,13 @@ def from_euler_angles(roll: Array, pitch: Array, yaw: Array) -> Quaternion:
     return product(product((zero, zero, sy, cy), (zero, sp, zero, cp)), (sr, zero, zero, cr))
 
 
-def tilt_cosine(q: Sequence[Array]) -> Array:
+def tilt_cosine(q: Iterable[Array]) -> Array:
     """Cosine of the angle between the body's and the world's z axis: 1 level, -1 upside down."""
     x, y, _, _ = q
     return 1.0 - 2.0 * (x * x + y * y)
 
 
-def random_turn(uniform: np.ndarray) -> np.ndarray:
+def random_turn(uniform: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternions spread evenly over all turns, from uniform numbers in 0..1.
 
     Args:

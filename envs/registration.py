@@ -102,6 +102,62 @@ def registered_ids() -> list[str]:
     return sorted(spec.id for spec in gym.registry.values() if spec.namespace == NAMESPACE)
 
 
+def _register_helicopters() -> None:
+    """Hover and funnel of Abbeel and Ng's helicopter, and the helicopter of the RL competitions."""
+    quaternion = ("q_x", "q_y", "q_z", "q_w")
+    register_system(
+        "HelicopterHover",
+        "beliefgym.envs.helicopter:Helicopter",
+        max_episode_steps=400,
+        partial={"Position": ("position_north", "position_east", "position_down", *quaternion)},
+    )
+    register_system(
+        "HelicopterFunnel",
+        "beliefgym.envs.helicopter_funnel:HelicopterFunnel",
+        max_episode_steps=600,
+        partial={
+            "Position": (
+                *(f"position_error_{axis}" for axis in ("forward", "right", "down")),
+                *(f"q_error_{axis}" for axis in "xyzw"),
+                "progress",
+            )
+        },
+    )
+    register_system(
+        "HelicopterCompetition",
+        "beliefgym.envs.helicopter_competition:HelicopterCompetition",
+        max_episode_steps=6000,
+        partial={"Position": ("position_forward", "position_right", "position_below", *quaternion[:3])},
+    )
+
+
+def _register_quadrotor() -> None:
+    """Hover under wind: all of the motion and the wind, the inertial measurement unit, and that with the position."""
+    imu = tuple(f"{sensor}_{axis}" for sensor in ("gyro", "accelerometer") for axis in "xyz")
+    position = ("position_x", "position_y", "position_z")
+    motion = (
+        *position,
+        *(f"velocity_{axis}" for axis in "xyz"),
+        *("q_x", "q_y", "q_z", "q_w", "roll_rate", "pitch_rate", "yaw_rate"),
+        *("rotor_front", "rotor_left", "rotor_back", "rotor_right"),
+        *("wind_x", "wind_y", "wind_z", "mean_wind_x", "mean_wind_y"),
+    )
+    register_system(
+        "QuadrotorHover",
+        "beliefgym.envs.quadrotor:Quadrotor",
+        max_episode_steps=500,
+        partial={"": motion, "IMU": imu, "IMUPosition": (*position, *imu)},
+    )
+
+
+def _register_mico() -> None:
+    """The payload lift: everything, and what the robot's own sensors tell, angles and torques."""
+    sensors = tuple(f"{kind}_{joint}" for kind in ("joint", "torque") for joint in range(1, 7))
+    register_system(
+        "MicoLift", "beliefgym.envs.mico:MicoLift", max_episode_steps=160, partial={"Torque": sensors}
+    )
+
+
 def register_all() -> None:
     """Register every environment of the package; a second call changes nothing."""
     if registered_ids():
@@ -119,6 +175,11 @@ def register_all() -> None:
         partial={"Position": ("x", "cos_theta", "sin_theta")},
     )
     _register_cart_pole_classics()
+    _register_helicopters()
+    _register_quadrotor()
+    _register_mico()
+    _register_sensors_of_helicopters()
+    _register_locomotion()
 
 
 def _register_cart_pole_classics() -> None:
@@ -135,4 +196,35 @@ def _register_cart_pole_classics() -> None:
             layers=[hide, ("ObservationNoise", {"std": std}), push],
             exposes={"noise": ("ObservationNoise", "std")},
             max_episode_steps=200,
+        )
+
+
+def _register_sensors_of_helicopters() -> None:
+    """The hover with noise on every component, and with a late observation."""
+    system = "beliefgym.envs.helicopter:Helicopter"
+    register_composed(
+        "HelicopterHoverNoisy",
+        system=system,
+        layers=[("ObservationNoise", {"std": 0.1})],
+        exposes={"noise": ("ObservationNoise", "std")},
+        max_episode_steps=400,
+    )
+    register_composed(
+        "HelicopterHoverDelayed",
+        system=system,
+        layers=[("ObservationDelay", {"steps": 1})],
+        exposes={"delay": ("ObservationDelay", "steps")},
+        max_episode_steps=400,
+    )
+
+
+def _register_locomotion() -> None:
+    """Gymnasium's planar MuJoCo tasks with their velocities hidden."""
+    for name in ("Hopper", "Walker2d", "HalfCheetah", "Swimmer", "InvertedPendulum"):
+        register_composed(
+            f"{name}Position",
+            base=f"beliefgym.envs.locomotion:{name}Env",
+            layers=[("PartialObservation", {"keep": ["qpos_*"]})],
+            parameters={"shown": ["qpos_*"]},
+            max_episode_steps=1000,
         )

@@ -4,7 +4,7 @@ Joint i sits in the frame of link i - 1 at `xyz`, turned by `rpy`: R = Rz(yaw) R
 roll, then pitch, then yaw; the link turns by q_i about the z axis of that frame. Mass, centre of mass and inertia
 (about the centre of mass) are in the link's frame. SI units.
 
-One table serves MuJoCo (`mjcf`) and the batched rigid-body equations of planning/rigid_body.py.
+One table serves MuJoCo (`mjcf`) and the batched rigid-body equations of rigid_body.py.
 """
 
 from __future__ import annotations
@@ -52,12 +52,6 @@ class Link:
         """(3, 3) from the joint's frame at q = 0 to the frame of the link before."""
         return rotation(self.rpy)
 
-    @property
-    def inertia_matrix(self) -> NDArray[np.float64]:
-        """(3, 3) about the centre of mass, in the link's frame."""
-        xx, yy, zz, xy, xz, yz = self.inertia
-        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
 
 @dataclass(frozen=True, kw_only=True)
 class Tip:
@@ -87,6 +81,12 @@ def rotation(rpy: Vector3) -> NDArray[np.float64]:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def inertia_matrix(inertia: tuple[float, float, float, float, float, float]) -> NDArray[np.float64]:
+    """(3, 3) from Ixx, Iyy, Izz, Ixy, Ixz, Iyz."""
+    xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def mjcf(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from beliefgym.scripts.training import git_commit, machine, versions
+from beliefgym.scripts.named_record import check_name, markdown_table, write_record
+from beliefgym.scripts.training import machine
 
 BENCHMARKS = {"env": "beliefgym.scripts.benchmarks.env:run"}
 
@@ -34,32 +33,16 @@ class Benchmark:
 
     def run(self) -> int:
         """Measure, write, print; 0 even where a target is missed: the table says so."""
-        if self.name not in BENCHMARKS:
-            near = get_close_matches(self.name, BENCHMARKS, n=1)
-            raise ValueError(
-                f"there is no benchmark {self.name!r}"
-                + (f"; did you mean {near[0]!r}?" if near else "")
-                + f" (known: {', '.join(BENCHMARKS)})"
-            )
-        folder = self.results / "benchmark"
-        folder.mkdir(parents=True, exist_ok=True)
+        check_name("benchmark", self.name, BENCHMARKS)
         module, _, function = BENCHMARKS[self.name].partition(":")
         console = Console()
         with console.status("measuring") as status:
             rows, limits = getattr(import_module(module), function)(
                 lambda text: status.update(f"measuring {text}")
             )
-        record = {
-            "command": f"beliefgym benchmark {self.name}",
-            "versions": versions(),
-            "git_commit": git_commit(),
-            "machine": machine(),
-            "limits": limits,
-            "rows": rows,
-        }
-        path = folder / f"{self.name}.json"
-        path.write_text(json.dumps(record, indent=1) + "\n")
-        path.with_suffix(".md").write_text(markdown(record))
+        record = {"command": f"beliefgym benchmark {self.name}", "limits": limits, "rows": rows}
+        path = self.results / "benchmark" / f"{self.name}.json"
+        write_record(path, record, markdown({**record, "machine": machine()}))
         console.print(table(rows))
         for name, limit in limits.items():
             console.print(f"{name}: {limit}")
@@ -97,8 +80,8 @@ def table(rows: list[dict[str, Any]]) -> Table:
 def markdown(record: dict[str, Any]) -> str:
     """The record as a Markdown page."""
     lines = [f"# {record['command']}", "", f"Machine: {record['machine']}", ""]
-    lines += ["| " + " | ".join(HEADER) + " |", "|---|---:|---|---:|---:|---:|---|"]
-    lines += ["| " + " | ".join(_cells(one)) + " |" for one in record["rows"]]
+    numbers = ("ours", "rival's", "ratio", "target")
+    lines += markdown_table(HEADER, [_cells(one) for one in record["rows"]], numbers)
     lines += [
         "",
         "Medians of interleaved repeats; their ranges stand in the JSON file. Limits measured beside:",

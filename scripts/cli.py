@@ -27,6 +27,7 @@ def commands() -> dict[str, Any]:
     from beliefgym.scripts.evaluate import Evaluate, Record
     from beliefgym.scripts.leaderboard.command import Leaderboard
     from beliefgym.scripts.listing import Agents, Envs
+    from beliefgym.scripts.reproduce import Reproduce
     from beliefgym.scripts.train import Train
 
     return {
@@ -34,6 +35,7 @@ def commands() -> dict[str, Any]:
         "evaluate": Evaluate,
         "record": Record,
         "leaderboard": Leaderboard,
+        "reproduce": Reproduce,
         "benchmark": Benchmark,
         "envs": Envs,
         "agents": Agents,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,7 +26,9 @@ def run_cell(cell_data: Mapping[str, Any], report: Callable[[dict[str, Any]], No
     Returns:
         plain data: evaluation returns, learning curve, references, timing, versions, spec.
     """
-    torch.set_num_threads(1)  # cells run side by side; small networks do not gain from more
+    # cells run side by side; small networks do not gain from more, and batches of MuJoCo would crowd the others out
+    torch.set_num_threads(1)
+    os.environ.setdefault("BELIEFGYM_THREADS", "1")
     cell = Cell.from_dict(cell_data)
     task = Task.from_dict(cell.task)
     scale = references(task)

@@ -18,11 +18,9 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
+from beliefgym.envs.joint_names import observation_names
 
-# MuJoCo's joint types with more than one coordinate: number of positions and of velocities
-_FREE, _BALL = 0, 1
-_COORDINATES = {_FREE: (7, 6), _BALL: (4, 3)}
+AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 
 def layers(env: AnyEnv) -> Iterator[AnyEnv]:
@@ -159,23 +157,5 @@ def _attribute(env: AnyEnv, name: str) -> Any:
 
 
 def _mujoco_names(base: AnyEnv) -> list[str] | None:
-    """Names after `observation_structure`: the observation's parts in order, with their sizes."""
     structure, model = getattr(base, "observation_structure", None), getattr(base, "model", None)
-    if structure is None or model is None:
-        return None
-    positions, velocities = [], []
-    for i in range(model.njnt):
-        joint = model.joint(i).name or f"joint_{i}"
-        n_positions, n_velocities = _COORDINATES.get(int(model.jnt_type[i]), (1, 1))
-        positions += [f"qpos_{joint}{suffix}" for suffix in _suffixes(n_positions)]
-        velocities += [f"qvel_{joint}{suffix}" for suffix in _suffixes(n_velocities)]
-    parts = {"qpos": positions[int(structure.get("skipped_qpos", 0)) :], "qvel": velocities}
-    names: list[str] = []
-    for part, size in structure.items():
-        if not part.startswith("skipped_"):
-            names += parts.get(part, [f"{part}_{i}" for i in range(int(size))])
-    return names
-
-
-def _suffixes(n: int) -> list[str]:
-    return [""] if n == 1 else [f"_{i}" for i in range(n)]
+    return None if structure is None or model is None else observation_names(model, structure)

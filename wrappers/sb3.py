@@ -101,12 +101,12 @@ class SB3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute for each copy: the batch's own, split where it has one row a copy."""
-        value = (
-            getattr(self.env.unwrapped, attr_name)
-            if not hasattr(self.env, attr_name)
-            else getattr(self.env, attr_name)
-        )
         chosen = list(self._get_indices(indices))
+        target: Any = self.env if hasattr(self.env, attr_name) else self.env.unwrapped
+        if not hasattr(target, attr_name) and hasattr(target, "get_attr"):  # separate copies: SyncVectorEnv
+            values = target.get_attr(attr_name)
+            return [values[i] for i in chosen]
+        value = getattr(target, attr_name)
         if isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,):
             return [value[i] for i in chosen]
         return [value for _ in chosen]

@@ -6,6 +6,7 @@ from beliefgym.envs.planning.dynamic_programming import GridController, pendulum
 from beliefgym.envs.planning.grid import Axis, GridValue
 from beliefgym.envs.planning.ilqr import ILQR, ILQRSolution
 from beliefgym.envs.planning.linearisation import expand_cost, linearise
+from beliefgym.envs.planning.mico import PayloadFeedforward, mico_expert
 
 __all__ = [
     "ILQR",
@@ -14,10 +15,12 @@ __all__ = [
     "GridController",
     "GridValue",
     "ILQRSolution",
+    "PayloadFeedforward",
     "TreePlans",
     "cart_pole_expert",
     "expand_cost",
     "linearise",
+    "mico_expert",
     "pendulum_expert",
     "tree_search",
     "value_iteration",

@@ -12,12 +12,13 @@ from difflib import get_close_matches
 from typing import Any
 
 from beliefgym.agents import find_agent
+from beliefgym.envs import registered_ids
 from beliefgym.scripts.leaderboard.errors import LeaderboardError
 from beliefgym.scripts.leaderboard.grid import AgentVariant, Cell, Grid, product
 from beliefgym.wrappers.task import Task
 
 POSITION_ONLY = ("beliefgym/PendulumPosition-v0", "beliefgym/CartPoleSwingUpPosition-v0")
-REFERENCES = {"random": 0, "expert": 0}
+REFERENCES = {"random": 0, "expert": 0}  # agents that do not train
 RUNNER = "beliefgym.scripts.run_cell:run_cell"
 
 TIERS: dict[str, dict[str, Any]] = {
@@ -50,6 +51,14 @@ TIERS: dict[str, dict[str, Any]] = {
         },
         "seeds": 3,
         "eval_episodes": 300,
+        "time_limit_s": 3600,
+    },
+    "difficulty": {
+        "description": "Every environment and an agent without memory: what hiding a part of the state costs it.",
+        "tasks": tuple(registered_ids()),
+        "steps": {"ppo": 500_000},
+        "seeds": 3,
+        "eval_episodes": 100,
         "time_limit_s": 3600,
     },
 }

@@ -45,7 +45,10 @@ def test_the_two_actions_are_the_two_pushes():
 
 def test_the_expert_balances_for_the_whole_time():
     env = gym.make_vec(
-        "beliefgym/CartPoleBalance-v0", 500, vectorization_mode="vector_entry_point", autoreset_mode="DISABLED"
+        "beliefgym/CartPoleBalance-v0",
+        500,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode="DISABLED",
     )
     controller = env.unwrapped.expert()
     env.reset(seed=7)

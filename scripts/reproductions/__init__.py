@@ -1,0 +1,1 @@
+"""What `beliefgym reproduce NAME` computes, one file a result."""

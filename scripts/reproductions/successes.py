@@ -1,0 +1,100 @@
+"""What counts as having done each task: a measure of the last second's true states, and its limit.
+
+A measure takes a system and states (k, n, n_state) of the last second and gives (n,) numbers; below the limit is
+success. Where holding matters it is the largest value over the second, where arriving matters the last one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Success:
+    """A criterion.
+
+    Args:
+        description: in words.
+        measure: (system, states (k, n, n_state)) -> (n,).
+        limit: success is below it.
+        unit: of the measure.
+    """
+
+    description: str
+    measure: Callable[[Any, Floats], Floats]
+    limit: float
+    unit: str
+
+
+def _columns(system: Any, states: Floats, *names: str) -> Floats:
+    """(k, n, len(names)) of named state components."""
+    return states[..., [system.state_names.index(name) for name in names]]
+
+
+def _from_upright(*names: str, upright: float = 0.0) -> Callable[[Any, Floats], Floats]:
+    """The largest angle from upright over the last second, of all the named joints."""
+
+    def measure(system: Any, states: Floats) -> Floats:
+        angle = _columns(system, states, *names) - upright
+        largest: Floats = np.abs((angle + np.pi) % (2 * np.pi) - np.pi).max(axis=(0, 2))
+        return largest
+
+    return measure
+
+
+def _distance_at_the_end(*names: str) -> Callable[[Any, Floats], Floats]:
+    """How far the named coordinates are from 0 in the last state."""
+
+    def measure(system: Any, states: Floats) -> Floats:
+        distance: Floats = np.linalg.norm(_columns(system, states, *names)[-1], axis=-1)
+        return distance
+
+    return measure
+
+
+_POSITION = ("position_north", "position_east", "position_down")
+
+_UPRIGHT = Success("held upright for the last second", _from_upright("theta"), 0.2, "rad")
+_HOVERS = Success("within 0.5 m of the hover point at the end", _distance_at_the_end(*_POSITION), 0.5, "m")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An expert's task.
+
+    Args:
+        env_id: of the environment.
+        success: the criterion.
+        parameters: of the system, where they differ from the registered ones.
+    """
+
+    env_id: str
+    success: Success
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The task and the criterion in words."""
+        changed = "".join(f", {name}={value}" for name, value in self.parameters.items())
+        return f"{self.env_id.rpartition('/')[2]}{changed}: {self.success.description}"
+
+
+TRIALS: tuple[Trial, ...] = (
+    Trial("beliefgym/Pendulum-v0", _UPRIGHT),
+    Trial("beliefgym/CartPoleSwingUp-v0", _UPRIGHT),
+    Trial(
+        "beliefgym/CartPoleBalance-v0",
+        Success("still standing after 500 steps", _from_upright("theta"), 0.2, "rad"),
+    ),
+    # at gusts of 1 the optimum of the source's cost stays in the air but does not stay within 0.5 m; a stiffer LQR does
+    Trial("beliefgym/HelicopterHover-v0", _HOVERS, {"wrench_noise_std": 0.1}),
+    Trial("beliefgym/HelicopterHover-v0", _HOVERS),
+    Trial("beliefgym/HelicopterHover-v0", _HOVERS, {"expert_effort": 0.02, "max_change": 1.0}),
+)
