@@ -9,7 +9,7 @@ import numpy as np
 from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
-from beliefgym.envs.baxter import JOINTS, BaxterArm, BaxterReach, Floats
+from beliefgym.envs.baxter import BaxterArm, BaxterReach, Floats
 from beliefgym.envs.system import Array, constant
 
 if TYPE_CHECKING:
@@ -131,5 +131,3 @@ class BaxterReachHand(BaxterArm):
 
         draw_baxter(canvas, self.arm, state[:7], place=state[14:17])
 
-
-assert BaxterReachHand.state_names[:7] == tuple(f"{joint}_angle" for joint in JOINTS)

@@ -73,6 +73,8 @@ class MicoLift(MujocoSystem):
     heaviest. `reset(options={"state": ...})` takes masses of 0.001..2 kg. End: after 160 steps (8 s).
     Versions: v0, the first. `beliefgym/MicoLiftTorque-v0` shows the angles and the torques only, the thesis's
     observations: of one instant, the angles do not tell the mass, angles and torques of an arm at rest do.
+    `beliefgym/MicoLiftTorqueNoisy-v0` adds noise of 0.002 rad and 0.3 N m (chosen here): then the mass is known only
+    after a while.
 
     Chosen here (the thesis and the robot's description do not say): dt, the 10 ms of the inner controller, the times
     (grasp_time=4 puts the start of the lift at half of the episode), the poses and their spread, the gains, the

@@ -156,6 +156,14 @@ def _register_mico() -> None:
     register_system(
         "MicoLift", "beliefgym.envs.mico:MicoLift", max_episode_steps=160, partial={"Torque": sensors}
     )
+    register_composed(
+        "MicoLiftTorqueNoisy",
+        system="beliefgym.envs.mico:MicoLift",
+        parameters={"components": list(sensors)},
+        layers=[("ObservationNoise", {"std": [0.002] * 6 + [0.3] * 6})],  # rad, N m
+        exposes={"noise": ("ObservationNoise", "std")},
+        max_episode_steps=160,
+    )
 
 
 def register_all() -> None:

@@ -61,6 +61,12 @@ def _distance_at_the_end(*names: str) -> Callable[[Any, Floats], Floats]:
 
 _POSITION = ("position_north", "position_east", "position_down")
 
+def _lag_at_the_end(system: Any, states: Floats) -> Floats:
+    """How far the joint that is farthest from its reference is from it in the last state."""
+    lag: Floats = np.abs(system.tracking_error(states[-1])).max(axis=-1)
+    return lag
+
+
 _UPRIGHT = Success("held upright for the last second", _from_upright("theta"), 0.2, "rad")
 _HOVERS = Success("within 0.5 m of the hover point at the end", _distance_at_the_end(*_POSITION), 0.5, "m")
 
@@ -97,4 +103,8 @@ TRIALS: tuple[Trial, ...] = (
     Trial("beliefgym/HelicopterHover-v0", _HOVERS, {"wrench_noise_std": 0.1}),
     Trial("beliefgym/HelicopterHover-v0", _HOVERS),
     Trial("beliefgym/HelicopterHover-v0", _HOVERS, {"expert_effort": 0.02, "max_change": 1.0}),
+    Trial(
+        "beliefgym/MicoLift-v0",
+        Success("every joint within 0.01 rad of the lift's end", _lag_at_the_end, 1e-2, "rad"),
+    ),
 )
