@@ -1,5 +1,7 @@
 """Physical systems, their Gymnasium environments and registration."""
 
+from beliefgym.envs.baxter import BaxterReach
+from beliefgym.envs.baxter_hand import BaxterReachHand
 from beliefgym.envs.cart_pole import CartPole
 from beliefgym.envs.cart_pole_balance import CartPoleBalance
 from beliefgym.envs.collect import collect
@@ -24,6 +26,8 @@ from beliefgym.envs.true_state import TrueState
 from beliefgym.envs.vector_env import SystemVectorEnv
 
 __all__ = [
+    "BaxterReach",
+    "BaxterReachHand",
     "CartPole",
     "CartPoleBalance",
     "HalfCheetahEnv",

@@ -251,10 +251,11 @@ class BaxterArm(MujocoSystem):
 
     def reward(self, state: Array, action: Array, next_state: Array) -> Array:
         """Near, slow and gentle; in 0..1; see the class."""
+        xp = array_namespace(next_state)
         velocity = next_state[..., 7:14]
         effort = action / constant(self.arm.efforts, action)
-        slow = (1.0 / (1.0 + velocity * velocity)).mean(-1)
-        gentle = 1.0 - (effort * effort).mean(-1)
+        slow = xp.mean(1.0 / (1.0 + velocity * velocity), axis=-1)
+        gentle = 1.0 - xp.mean(effort * effort, axis=-1)
         return self.nearness(next_state) * (0.8 + 0.1 * slow + 0.1 * gentle)
 
     def draw_angles(self, streams: RandomStreams, mask: NDArray[np.bool_] | None, part: float) -> Floats:
@@ -341,7 +342,9 @@ class BaxterReach(BaxterArm):
             raise ValueError(f"expected a target of 7 joint angles, got {len(self.target)}")
         for joint, angle, least, most in zip(JOINTS, self.target, low, high, strict=True):
             if not least <= angle <= most:
-                raise ValueError(f"expected the target of {joint} within {least:g}..{most:g} rad, got {angle!r}")
+                raise ValueError(
+                    f"expected the target of {joint} within {least:g}..{most:g} rad, got {angle!r}"
+                )
 
     def observe(self, state: Array) -> Array:
         """The state: angles and velocities."""
@@ -350,15 +353,19 @@ class BaxterReach(BaxterArm):
     def nearness(self, state: Array) -> Array:
         """mean(1 / (1 + (e / 0.2 rad)^2)) over the joints."""
         error = (state[..., :7] - constant(np.array(self.target), state)) * 5.0
-        return (1.0 / (1.0 + error * error)).mean(-1)
+        return array_namespace(state).mean(1.0 / (1.0 + error * error), axis=-1)
 
     def stage_cost(self, state: Array, action: Array) -> Array:
         """Quadratic in the distance from the target at rest, and in the torque beyond the one that holds it."""
+        xp = array_namespace(state)
         error = state[..., :7] - constant(np.array(self.target), state)
         velocity = state[..., 7:14]
         held = self.arm.gravity_torque(np.array(self.target))
         effort = (action - constant(held, action)) / constant(self.arm.efforts, action)
-        return (error * error).sum(-1) + 0.01 * (velocity * velocity).sum(-1) + 0.01 * (effort * effort).sum(-1)
+        quadratic = xp.sum(error * error, axis=-1)
+        return (
+            quadratic + 0.01 * xp.sum(velocity * velocity, axis=-1) + 0.01 * xp.sum(effort * effort, axis=-1)
+        )
 
     def initial_state(
         self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None

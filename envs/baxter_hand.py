@@ -84,13 +84,17 @@ class BaxterReachHand(BaxterArm):
     def nearness(self, state: Array) -> Array:
         """1 / (1 + (D / 0.1 m)^2)."""
         miss = (self.arm.tip_position(state[..., :7]) - state[..., 14:17]) * 10.0
-        return 1.0 / (1.0 + (miss * miss).sum(-1))
+        return 1.0 / (1.0 + array_namespace(state).sum(miss * miss, axis=-1))
 
     def stage_cost(self, state: Array, action: Array) -> Array:
         """100 D^2 + 0.01 |v|^2 + 0.01 |torque / effort|^2."""
+        xp = array_namespace(state)
         miss = (self.arm.tip_position(state[..., :7]) - state[..., 14:17]) * 10.0
         velocity, effort = state[..., 7:14], action / constant(self.arm.efforts, action)
-        return (miss * miss).sum(-1) + 0.01 * (velocity * velocity).sum(-1) + 0.01 * (effort * effort).sum(-1)
+        quadratic = xp.sum(miss * miss, axis=-1)
+        return (
+            quadratic + 0.01 * xp.sum(velocity * velocity, axis=-1) + 0.01 * xp.sum(effort * effort, axis=-1)
+        )
 
     def initial_state(
         self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None
@@ -130,4 +134,3 @@ class BaxterReachHand(BaxterArm):
         from beliefgym.envs.arm_picture import draw_baxter
 
         draw_baxter(canvas, self.arm, state[:7], place=state[14:17])
-

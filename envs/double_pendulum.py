@@ -48,7 +48,7 @@ class DoublePendulum(System):
 
     | # | state              | unit  |   | # | observation        | range     |   | # | action | range (N m) |
     |---|--------------------|-------|---|---|--------------------|-----------|---|---|--------|-------------|
-    | 0 | theta_1            | rad   |   | 0 | cos_theta_1        | -1..1     |   | 0 | drive  | -10..10     |
+    | 0 | theta_1            | rad   |   | 0 | cos_theta_1        | -1..1     |   | 0 | drive  | -12..12     |
     | 1 | angular_velocity_1 | rad/s |   | 1 | sin_theta_1        | -1..1     |   |   |        |             |
     | 2 | theta_2            | rad   |   | 2 | cos_theta_2        | -1..1     |   |   |        |             |
     | 3 | angular_velocity_2 | rad/s |   | 3 | sin_theta_2        | -1..1     |   |   |        |             |
@@ -68,7 +68,7 @@ class DoublePendulum(System):
     Versions: v0, the first. `beliefgym/DoublePendulumSwingUpPosition-v0` shows the cosines and sines only.
 
     Chosen here: the default actuation, the limit of the drive (to hold both links level takes g (m1 l1 + m2 (l1 + l2))
-    = 29.4 N m at the shoulder, so 10 N m must swing to and fro), the reward, the start, the length of the episode, and
+    = 29.4 N m at the shoulder, so 12 N m must swing to and fro), the reward, the start, the length of the episode, and
     3 substeps (without drive and damping, energy drifts by less than 0.3 J within an episode from any state with up to
     35 J, where hanging has -29.4 J and standing +29.4 J; with one substep it drifts by up to 18 J).
 
@@ -92,7 +92,7 @@ class DoublePendulum(System):
     damping_2: float = 0.0
     gravity: float = 9.81
     actuation: Literal["shoulder", "elbow", "acceleration"] = "shoulder"
-    max_drive: float = 10.0
+    max_drive: float = 12.0
     start_spread: float = 0.1
     substeps: int = 3
 

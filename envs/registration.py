@@ -148,6 +148,19 @@ def _register_quadrotor() -> None:
         max_episode_steps=500,
         partial={"": motion, "IMU": imu, "IMUPosition": (*position, *imu)},
     )
+    noise = [0.01] * 3 + [0.2] * 3  # rad/s, m/s^2
+    for suffix, components, std in (
+        ("IMUNoisy", imu, noise),
+        ("IMUPositionNoisy", (*position, *imu), [0.002] * 3 + noise),
+    ):
+        register_composed(
+            f"QuadrotorHover{suffix}",
+            system="beliefgym.envs.quadrotor:Quadrotor",
+            parameters={"components": list(components)},
+            layers=[("ObservationNoise", {"std": std})],
+            exposes={"noise": ("ObservationNoise", "std")},
+            max_episode_steps=500,
+        )
 
 
 def _register_mico() -> None:
@@ -186,6 +199,7 @@ def register_all() -> None:
     _register_helicopters()
     _register_quadrotor()
     _register_mico()
+    _register_baxter()
     _register_sensors_of_helicopters()
     _register_locomotion()
 
@@ -205,6 +219,23 @@ def _register_cart_pole_classics() -> None:
             exposes={"noise": ("ObservationNoise", "std")},
             max_episode_steps=200,
         )
+
+
+def _register_baxter() -> None:
+    """Reaching with Baxter's left arm: a joint configuration, and a place for the hand."""
+    angles = tuple(f"{joint}_angle" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2"))
+    register_system(
+        "BaxterReach",
+        "beliefgym.envs.baxter:BaxterReach",
+        max_episode_steps=200,
+        partial={"Position": angles},
+    )
+    register_system(
+        "BaxterReachHand",
+        "beliefgym.envs.baxter_hand:BaxterReachHand",
+        max_episode_steps=200,
+        partial={"Position": (*angles, "target_x", "target_y", "target_z")},
+    )
 
 
 def _register_sensors_of_helicopters() -> None:

@@ -255,4 +255,3 @@ def _combine(axes: tuple[Array, Array, Array], weights: ArrayLike, start: Array 
             total = part if total is None else total + part
     assert total is not None
     return total
-

@@ -1,6 +1,12 @@
 """Planners and experts: batched optimal control on a `System`'s true model. They know no Gymnasium."""
 
 from beliefgym.envs.planning.action_tree import TreePlans, tree_search
+from beliefgym.envs.planning.arm import (
+    ReachController,
+    hand_reach_expert,
+    inverse_kinematics,
+    joint_reach_expert,
+)
 from beliefgym.envs.planning.cart_pole import CartPoleController, cart_pole_expert
 from beliefgym.envs.planning.dynamic_programming import GridController, pendulum_expert, value_iteration
 from beliefgym.envs.planning.grid import Axis, GridValue
@@ -16,9 +22,13 @@ __all__ = [
     "GridValue",
     "ILQRSolution",
     "PayloadFeedforward",
+    "ReachController",
     "TreePlans",
     "cart_pole_expert",
     "expand_cost",
+    "hand_reach_expert",
+    "inverse_kinematics",
+    "joint_reach_expert",
     "linearise",
     "mico_expert",
     "pendulum_expert",

@@ -61,6 +61,7 @@ def _distance_at_the_end(*names: str) -> Callable[[Any, Floats], Floats]:
 
 _POSITION = ("position_north", "position_east", "position_down")
 
+
 def _lag_at_the_end(system: Any, states: Floats) -> Floats:
     """How far the joint that is farthest from its reference is from it in the last state."""
     lag: Floats = np.abs(system.tracking_error(states[-1])).max(axis=-1)
@@ -106,5 +107,14 @@ TRIALS: tuple[Trial, ...] = (
     Trial(
         "beliefgym/MicoLift-v0",
         Success("every joint within 0.01 rad of the lift's end", _lag_at_the_end, 1e-2, "rad"),
+    ),
+    Trial(
+        "beliefgym/QuadrotorHover-v0",
+        Success(
+            "within 0.2 m of the hover point at the end",
+            _distance_at_the_end("position_x", "position_y", "position_z"),
+            0.2,
+            "m",
+        ),
     ),
 )

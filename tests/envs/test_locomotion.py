@@ -231,6 +231,7 @@ def test_the_expert_sees_gymnasiums_observation(name):
         assert np.array_equal(found, observation)
         if terminated:
             env.reset()
+    observation, _ = env.reset(seed=1)
     assert controller.act(env.state[None]).shape == (1, len(env.action_names))
     assert np.array_equal(controller.act(env.state[None])[0], controller.policy(observation[None])[0])
     assert controller.kind == env.expert_kind == "trained full-state PPO"
