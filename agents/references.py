@@ -14,6 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 import beliefgym.envs
 from beliefgym.agents.evaluation import evaluate
 from beliefgym.agents.registry import make_agent
@@ -83,8 +85,12 @@ def measure_all(env_ids: Iterable[str], path: Path = PATH, told: Callable[[str],
     """Measure the references of the given environments and write the table; what it says of others stays."""
     kept = json.loads(path.read_text())["references"] if path.exists() else {}
     table = {env_id: kept[env_id] for env_id in registered_ids() if env_id in kept}
+    measured: dict[Any, References] = {}
     for env_id in env_ids:
-        found = measure(env_id)
+        key = _what_decides_returns(env_id)
+        if key not in measured:
+            measured[key] = measure(env_id)
+        found = measured[key]
         told(f"{env_id}: random {found.random:.1f}, expert {found.expert:.1f}")
         table[env_id] = {name: round(value, 4) for name, value in vars(found).items()}
     table = dict(sorted(table.items()))
@@ -94,3 +100,10 @@ def measure_all(env_ids: Iterable[str], path: Path = PATH, told: Callable[[str],
     )
     os.replace(temporary, path)
     _table.cache_clear()
+
+
+def _what_decides_returns(env_id: str) -> Any:
+    """Equal for ids that differ only in what they show: neither the random policy nor the expert looks at that."""
+    env = gym.make(env_id)
+    system = getattr(env.unwrapped, "system", None)
+    return env_id if system is None else (system, str(env.action_space), gym.spec(env_id).max_episode_steps)

@@ -75,7 +75,7 @@ def _capsules(arm: RigidArm, angles: Floats) -> list[Capsule]:
     """The capsules of links and hand in space."""
     frames = arm.frames(angles)
     capsules = []
-    for item, x, y, z, origin in zip((*arm.links, arm.tip), *frames, strict=True):
+    for item, x, y, z, origin in zip(arm.parts, *frames, strict=True):
         turn = np.stack([x, y, z], axis=1)
         capsules += [
             (origin + turn @ start, origin + turn @ end, radius) for start, end, radius in item.shape

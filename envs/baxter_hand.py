@@ -9,7 +9,8 @@ import numpy as np
 from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
-from beliefgym.envs.baxter import BaxterArm, BaxterReach, Floats
+from beliefgym.envs.baxter import BaxterReach
+from beliefgym.envs.baxter_arm import BaxterArm, Floats
 from beliefgym.envs.system import Array, constant
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ ROUNDS = 1000  # of drawing targets, before they are called impossible
 class BaxterReachHand(BaxterArm):
     """Baxter's left hand is to reach a place and stay there, the arm held by its motors against gravity.
 
-    The arm, its torques, their noise, its start and its limits are those of `BaxterReach`. The place is a part of the
-    state that does not change, and is shown to the agent.
+    The arm, its torques, their noise (1 % of the efforts), its start and its limits are those of `BaxterReach`;
+    contacts are off. The place is a part of the state that does not change, and is shown to the agent.
 
     | #    | state                                                      | unit  |
     |------|------------------------------------------------------------|-------|

@@ -107,7 +107,8 @@ class MujocoSystem(System):
         n_controls = self.substeps if np.ndim(control) > motion.ndim else 1
         controls = np.ascontiguousarray(control, dtype=np.float64).reshape(len(rows), n_controls, model.nu)
         # MuJoCo takes a control that is not a number for 0, and logs what it finds bad: such rows do not reach it
-        good = (np.abs(rows) < HUGE).all(axis=1) & (np.abs(controls) < HUGE).all(axis=(1, 2))
+        good = np.asarray((np.abs(rows) < HUGE).all(axis=1))
+        good &= (np.abs(controls) < HUGE).all(axis=(1, 2))
         if not good.all():
             rows = np.where(good[:, None], rows, 0.0)
             controls = np.where(good[:, None, None], controls, 0.0)

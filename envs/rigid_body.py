@@ -33,6 +33,7 @@ from beliefgym.envs.serial_arm import Link, Tip, Vector3, inertia_matrix, rotati
 from beliefgym.envs.system import Array, constant
 
 Floats = NDArray[np.float64]
+Weights = list[tuple[int, float]]
 
 
 class Frames(NamedTuple):
@@ -73,6 +74,11 @@ class RigidArm:
         """Number of joints."""
         return len(self.links)
 
+    @property
+    def parts(self) -> tuple[Link | Tip, ...]:
+        """The links, and what is fixed to the last."""
+        return (*self.links, self.tip)
+
     @cached_property
     def limits(self) -> tuple[Floats, Floats]:
         """Lowest and highest joint angles in rad, each (dof,); infinite for continuous joints."""
@@ -96,12 +102,14 @@ class RigidArm:
         nothing = 0.0 * angles[..., :1]
         x, y, z = (constant(column, angles) + nothing for column in rotation(self.base_rpy).T)
         origin = constant(np.array(self.base_xyz), angles) + nothing
+        cosines, sines = xp.cos(angles), xp.sin(angles)
         result = Frames([], [], [], [])
-        for i, item in enumerate((*self.links, self.tip)):
-            origin = _combine((x, y, z), item.xyz, origin)
-            x, y, z = (_combine((x, y, z), column) for column in rotation(item.rpy).T)
+        for i, (place, *columns) in enumerate(self._placements):
+            axes = x, y, z
+            origin = _combine(axes, place, origin)
+            x, y, z = (_combine(axes, column) for column in columns)
             if i < len(self.links):
-                cosine, sine = xp.cos(angles[..., i : i + 1]), xp.sin(angles[..., i : i + 1])
+                cosine, sine = cosines[..., i : i + 1], sines[..., i : i + 1]
                 x, y = cosine * x + sine * y, cosine * y - sine * x
             for parts, part in zip(result, (x, y, z, origin), strict=True):
                 parts.append(part)
@@ -172,22 +180,19 @@ class RigidArm:
         bias = self.inverse_dynamics(angles, velocities, np.zeros(self.dof), payload)
         free = np.asarray(torques, dtype=np.float64) - bias
         mass = self.mass_matrix(angles, payload)
-        solved: Floats = np.linalg.solve(mass, free[..., None])[..., 0]
-        return solved
+        return np.asarray(np.linalg.solve(mass, free[..., None])[..., 0], dtype=np.float64)
 
     def _newton_euler(
         self, angles: Floats, v: Floats, a: Floats, gravity: float, payload: ArrayLike | None
     ) -> Floats:
         """M_links a + c + gravity's torques, (..., dof)."""
         frames = self.frames(angles)
-        axes, places = (
-            np.stack(frames.z[:-1], axis=-2),
-            np.stack(frames.origin[:-1], axis=-2),
-        )  # (..., dof, 3)
+        axes = np.stack(frames.z[:-1], axis=-2)  # (..., dof, 3)
+        places = np.stack(frames.origin[:-1], axis=-2)
         turn = axes * v[..., None]
         w = np.cumsum(turn, axis=-2)
         w_before = w - turn
-        w_change = np.cumsum(axes * a[..., None] + np.cross(w_before, turn), axis=-2)
+        w_change: Floats = np.cumsum(axes * a[..., None] + np.cross(w_before, turn), axis=-2)
 
         rise = np.zeros(
             (*w_change.shape[:-1], 3)
@@ -222,19 +227,23 @@ class RigidArm:
         return torque
 
     @cached_property
+    def _placements(self) -> list[list[Weights]]:
+        """Place and axes x, y, z of each part at angle 0, by the axes of the part before."""
+        return [[_weights(vector) for vector in (part.xyz, *rotation(part.rpy).T)] for part in self.parts]
+
+    @cached_property
     def _bodies(self) -> tuple[Floats, Floats, NDArray[np.intp]]:
         """Masses (dof + 2,), inertias (dof + 2, 3, 3) and the link that each rides on; the last is the payload."""
-        items = (*self.links, self.tip)
+        items = self.parts
         masses = np.array([*(item.mass for item in items), 0.0])
         inertias = np.stack([*(inertia_matrix(item.inertia) for item in items), np.zeros((3, 3))])
         return masses, inertias, np.minimum(np.arange(self.dof + 2), self.dof - 1)
 
     def _centres(self, frames: Frames) -> tuple[Floats, Floats]:
         """Centres of mass (..., dof + 2, 3) and rotations (..., dof + 2, 3, 3) of the bodies."""
-        items = (*self.links, self.tip)
         centres = [
-            _combine((x, y, z), item.com, origin)
-            for item, x, y, z, origin in zip(items, *frames, strict=True)
+            _combine((x, y, z), _weights(item.com), origin)
+            for item, x, y, z, origin in zip(self.parts, *frames, strict=True)
         ]
         at = np.stack([*centres, frames.origin[-1]], axis=-2)
         columns = [np.stack([*part, part[-1]], axis=-2) for part in frames[:3]]
@@ -246,12 +255,16 @@ def _swing(w: Floats, w_change: Floats, arm: Floats) -> Floats:
     return np.cross(w_change, arm) + np.cross(w, np.cross(w, arm))
 
 
-def _combine(axes: tuple[Array, Array, Array], weights: ArrayLike, start: Array | None = None) -> Array:
-    """start + sum of weight * axis, leaving out weights that are 0 but for rounding (turns by pi/2)."""
+def _weights(vector: ArrayLike) -> Weights:
+    """Axis and weight of the components that are not 0 but for rounding (turns by pi/2 leave 6e-17)."""
+    numbers = np.asarray(vector, dtype=np.float64).tolist()
+    return [(i, weight) for i, weight in enumerate(numbers) if abs(weight) > 1e-12]
+
+
+def _combine(axes: tuple[Array, Array, Array], weights: Weights, start: Array | None = None) -> Array:
+    """start + sum of weight * axis."""
     total = start
-    for axis, weight in zip(axes, np.asarray(weights, dtype=np.float64).tolist(), strict=True):
-        if abs(weight) > 1e-12:
-            part = axis if weight == 1.0 else weight * axis
-            total = part if total is None else total + part
-    assert total is not None
+    for i, weight in weights:
+        part = axes[i] if weight == 1.0 else weight * axes[i]
+        total = part if total is None else total + part
     return total

@@ -38,7 +38,8 @@ from beliefgym.envs.planning.linearisation import expand_cost
 from beliefgym.envs.rigid_body import RigidArm
 
 if TYPE_CHECKING:
-    from beliefgym.envs.baxter import BaxterArm, BaxterReach
+    from beliefgym.envs.baxter import BaxterReach
+    from beliefgym.envs.baxter_arm import BaxterArm
     from beliefgym.envs.baxter_hand import BaxterReachHand
 
 Floats = NDArray[np.float64]
@@ -147,7 +148,7 @@ class ReachController:
         return self.system.clip(torque)
 
     def _approach(self, angles: Floats, velocity: Floats) -> Floats:
-        """Inverse dynamics of the way to the targets, (n, 7) N m; only the part beyond `efforts` is not scaled."""
+        """Inverse dynamics of the way to the targets, (n, 7) N m."""
         arm, h = self.system.arm, self.system.dt
         error = self.targets - angles
         way = np.abs(error) + 1e-12

@@ -218,7 +218,7 @@ class DoublePendulumController:
             horizon=self.known.horizon,
             stage_cost=self.stage_cost,
             terminal_cost=self.known.upright_cost,
-            max_iterations=15,
+            max_iterations=30,
             tolerance=1e-4,
         )
         self.states: Floats
