@@ -13,7 +13,7 @@ from beliefgym.envs.projection import Camera
 
 if TYPE_CHECKING:
     from beliefgym.envs.mico import MicoLift
-    from beliefgym.envs.planning.rigid_body import RigidArm
+    from beliefgym.envs.rigid_body import RigidArm
     from beliefgym.envs.rendering import Canvas
 
 CAMERA = Camera(azimuth=-1.15, elevation=0.3)

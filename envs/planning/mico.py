@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.mico import MicoLift
 from beliefgym.envs.mico_arm import LINKS, TIP
-from beliefgym.envs.planning.rigid_body import RigidArm
+from beliefgym.envs.rigid_body import RigidArm
 
 Floats = NDArray[np.float64]
 

@@ -68,8 +68,28 @@ def _lag_at_the_end(system: Any, states: Floats) -> Floats:
     return lag
 
 
+def _joint_error_at_the_end(system: Any, states: Floats) -> Floats:
+    """How far the joint that is farthest from the target is from it in the last state."""
+    error: Floats = np.abs(states[-1][..., :7] - np.array(system.target)).max(axis=-1)
+    return error
+
+
+def _hand_error_at_the_end(system: Any, states: Floats) -> Floats:
+    """How far the hand is from its target in the last state."""
+    seen = system.observe(states[-1])
+    hand, target = (
+        seen[..., [system.observation_names.index(f"{point}_{axis}") for axis in "xyz"]]
+        for point in ("hand", "target")
+    )
+    distance: Floats = np.linalg.norm(hand - target, axis=-1)
+    return distance
+
+
 _UPRIGHT = Success("held upright for the last second", _from_upright("theta"), 0.2, "rad")
 _HOVERS = Success("within 0.5 m of the hover point at the end", _distance_at_the_end(*_POSITION), 0.5, "m")
+_JOINTS = Success(
+    "every joint within 0.01 rad of the target at the end", _joint_error_at_the_end, 1e-2, "rad"
+)
 
 
 @dataclass(frozen=True)
@@ -116,5 +136,12 @@ TRIALS: tuple[Trial, ...] = (
             0.2,
             "m",
         ),
+    ),
+    # one step's default noise alone turns each wrist joint by about 0.008 rad: there 0.01 rad cannot be held
+    Trial("beliefgym/BaxterReach-v0", _JOINTS, {"actuation_noise_std": 0.0}),
+    Trial("beliefgym/BaxterReach-v0", _JOINTS),
+    Trial(
+        "beliefgym/BaxterReachHand-v0",
+        Success("the hand within 1 cm of its target at the end", _hand_error_at_the_end, 1e-2, "m"),
     ),
 )
