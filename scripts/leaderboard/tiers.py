@@ -56,7 +56,7 @@ TIERS: dict[str, dict[str, Any]] = {
     "difficulty": {
         "description": "Every environment and an agent without memory: what hiding a part of the state costs it.",
         "tasks": tuple(registered_ids()),
-        "steps": {"ppo": 300_000},
+        "steps": {"ppo": 200_000},
         "seeds": 3,
         "eval_episodes": 100,
         "time_limit_s": 3600,
