@@ -91,7 +91,7 @@ RECIPES: dict[str, Recipe] = {
             "policy_kwargs": _WIDE,
         },
     ),
-    "Walker2d": Recipe("Walker2d-v5", 1_536_000, 4, _PLAIN),
+    "Walker2d": Recipe("Walker2d-v5", 870_400, 4, _PLAIN),
     "Hopper": Recipe("Hopper-v5", 409_600, 4, _PLAIN),
     "Swimmer": Recipe(
         "Swimmer-v5",

@@ -4,6 +4,7 @@ from beliefgym.envs.baxter import BaxterReach
 from beliefgym.envs.baxter_hand import BaxterReachHand
 from beliefgym.envs.cart_pole import CartPole
 from beliefgym.envs.cart_pole_balance import CartPoleBalance
+from beliefgym.envs.catalogue import register_all
 from beliefgym.envs.collect import collect
 from beliefgym.envs.env import SystemEnv
 from beliefgym.envs.helicopter import Helicopter
@@ -17,9 +18,10 @@ from beliefgym.envs.locomotion import (
     Walker2dEnv,
 )
 from beliefgym.envs.mico import MicoLift
+from beliefgym.envs.mobile_base import MobileBase, MobileBaseKinematic
 from beliefgym.envs.pendulum import Pendulum
 from beliefgym.envs.quadrotor import Quadrotor
-from beliefgym.envs.registration import register_all, register_system, registered_ids
+from beliefgym.envs.registration import register_composed, register_system, registered_ids
 from beliefgym.envs.simulation import NonFiniteError
 from beliefgym.envs.system import System
 from beliefgym.envs.true_state import TrueState
@@ -37,6 +39,8 @@ __all__ = [
     "HopperEnv",
     "InvertedPendulumEnv",
     "MicoLift",
+    "MobileBase",
+    "MobileBaseKinematic",
     "NonFiniteError",
     "Pendulum",
     "Quadrotor",
@@ -48,6 +52,7 @@ __all__ = [
     "Walker2dEnv",
     "collect",
     "register_all",
+    "register_composed",
     "register_system",
     "registered_ids",
 ]

@@ -123,7 +123,16 @@ class Helicopter(System):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        above_0 = ("mass", "lift", "max_change", "max_distance", "max_speed", "max_rate", "max_tilt", "expert_effort")
+        above_0 = (
+            "mass",
+            "lift",
+            "max_change",
+            "max_distance",
+            "max_speed",
+            "max_rate",
+            "max_tilt",
+            "expert_effort",
+        )
         for name in above_0:
             if not getattr(self, name) > 0:
                 raise ValueError(f"expected {name} above 0, got {getattr(self, name)!r}")

@@ -13,8 +13,8 @@ from beliefgym.envs.projection import Camera
 
 if TYPE_CHECKING:
     from beliefgym.envs.mico import MicoLift
-    from beliefgym.envs.rigid_body import RigidArm
     from beliefgym.envs.rendering import Canvas
+    from beliefgym.envs.rigid_body import RigidArm
 
 CAMERA = Camera(azimuth=-1.15, elevation=0.3)
 THICKNESS = (0.08, 0.075, 0.06, 0.055, 0.05, 0.045, 0.04)  # m, of the rods from base to tip

@@ -88,9 +88,9 @@ class Quadrotor(System):
 
     Versions: v0, the first. `beliefgym/QuadrotorHover-v0` shows all that the motion depends on: observations 0-21, with
     the wind. `beliefgym/QuadrotorHoverIMU-v0` shows gyro and accelerometer only: the position can only be reckoned from
-    the start. `beliefgym/QuadrotorHoverIMUPosition-v0` adds the position, as motion capture gives it. With `Noisy` before
-    the version both have white noise of 0.01 rad/s, 0.2 m/s^2 and 0.002 m (chosen: a vibrating MEMS). An accelerometer
-    feels no gravity: it reads 0 in free fall and g along body z in hover, and shows a tilt only by what follows it.
+    the start. `beliefgym/QuadrotorHoverIMUPosition-v0` adds the position, as motion capture gives it. `...Noisy-v0` of
+    both has white noise of 0.01 rad/s, 0.2 m/s^2 and 0.002 m (chosen: a vibrating MEMS). An accelerometer feels no
+    gravity: it reads 0 in free fall and g along body z in hover, and shows a tilt only by what follows it.
 
     Sources of the numbers: AscTec Hummingbird as in RotorS (mass with rotors, inertia, arm, yaw_ratio, rotor_height,
     max_rotor_thrust; lag, the slower of its two; drag_0, its rotor drag at the rotor speed of hover) and RotorPy

@@ -9,7 +9,7 @@ environment, the batch of thousands of copies, the planner's derivatives and a p
 
 with u_t clipped to the action limits, eps standard normal, d the disturbances that a system names (forces of the
 wind, a drifting bias), and P the way back to a possible state (unit quaternions). To add a system: write one file
-with one subclass, and one line in registration.py.
+with one subclass, and one call in catalogue.py.
 """
 
 from __future__ import annotations

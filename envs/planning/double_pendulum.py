@@ -43,9 +43,14 @@ HELD_FOR = (1 / 3, 9 / 10)  # shortest and longest hold of a random guess, in th
 LIBRARY_GUESSES, GUESSES = 64, 16  # random first guesses, for the plan from hanging and for another state
 KEEP = 6  # of these are polished
 SMOOTH_TERMINAL = 20.0  # weight of l_T beside the smooth stage cost
-BASIN = 2.0  # l_T up to which the LQR at the upright catches (measured: all of 4000 states, with each actuation)
+BASIN = (
+    2.0  # l_T up to which the LQR at the upright catches (measured: all of 4000 states, with each actuation)
+)
 RESERVE = 0.9  # part of the drive that the known plan may use; the rest is left to its feedback
-REPLAN_COST = 1.0
+NOISY_RESERVE = (
+    0.9  # the same for the plans of the copies, of a system with noise; without noise they may use all
+)
+REPLAN_COST = 10.0
 PLANS_AT_ONCE = 256  # bounds the memory
 
 
@@ -172,7 +177,7 @@ def search(
         return planner.solve(states, actions)
 
     rough = solve(
-        replace(system, substeps=1), True, 80, np.repeat(start, guesses, 0), np.tile(firsts, (count, 1, 1))
+        replace(system, substeps=1), True, 60, np.repeat(start, guesses, 0), np.tile(firsts, (count, 1, 1))
     )
     loss = lack(rough.states[:, :-1], rough.actions).sum(axis=1) + upright_cost(rough.states[:, -1])
     keep = min(KEEP, guesses)
@@ -180,11 +185,9 @@ def search(
     chosen = (best + guesses * np.arange(count)[:, None]).ravel()
     starts = np.repeat(start, keep, axis=0)
     polished = solve(system, True, 20, starts, rough.actions[chosen])
-    final = solve(system, False, 40, starts, polished.actions)
+    final = solve(system, False, 20, starts, polished.actions)
     winner = final.cost.reshape(count, keep).argmin(axis=1) + keep * np.arange(count)
-    return ILQRSolution(
-        **{name: getattr(final, name)[winner] for name in ILQRSolution.__dataclass_fields__}
-    )
+    return ILQRSolution(**{name: getattr(final, name)[winner] for name in ILQRSolution.__dataclass_fields__})
 
 
 def _tempo(system: DoublePendulum) -> float:
@@ -213,13 +216,19 @@ class DoublePendulumController:
             replace(system, process_noise_std=0.0, actuation_noise_std=0.0, start_spread=0.0)
         )
         self.stage_cost = LackOfReward(system)
+        share = NOISY_RESERVE if system.noise_size else 1.0
         self.planner = ILQR(
-            system=system,
+            system=replace(system, max_drive=share * system.max_drive),
             horizon=self.known.horizon,
             stage_cost=self.stage_cost,
             terminal_cost=self.known.upright_cost,
             max_iterations=30,
             tolerance=1e-4,
+        )
+        self.smooth_planner = replace(
+            self.planner,
+            stage_cost=system.stage_cost,
+            terminal_cost=replace(self.known.upright_cost, weight=SMOOTH_TERMINAL),
         )
         self.states: Floats
         self.actions: Floats
@@ -292,42 +301,40 @@ class DoublePendulumController:
         self.planned[rows] = True
 
     def _first_guess(self, start: Floats, rows: Integers) -> Floats:
-        """(rows, T, 1): the best of the known plan, its mirror image and the old plan; one that is searched for
-        where none of these ends near the upright."""
-        known, count = self.known, len(rows)
-        guesses, ends, costs = [], [], []
-        for sign in (1.0, -1.0):
+        """(rows, T, 1): the best of the known plan, its mirror image and the old plan, followed with their gains;
+        where it does not end near the upright, what iLQR makes of it with the smooth cost, or else a search."""
+        known, horizon = self.known, self.known.horizon
 
-            def policy(t: int, s: Floats, sign: float = sign) -> Floats:
-                return sign * known.actions[t] + wrapped(s - sign * known.states[t]) @ known.gains[t].T
-
-            rolled = self._roll_out(start, policy)
-            for kept, new in zip((guesses, ends, costs), rolled, strict=True):
-                kept.append(new)
-        if self.planned[rows].any():
-            actions, end, cost = self._roll_out(
-                start, lambda t, s: self._follow(s, rows, np.minimum(self.clock[rows] + t, known.horizon))
+        def image(sign: float) -> Policy:
+            return lambda t, s: (
+                sign * known.actions[t] + wrapped(s - sign * known.states[t]) @ known.gains[t].T
             )
-            guesses.append(actions)
-            ends.append(np.where(self.planned[rows], end, np.inf))
-            costs.append(np.where(self.planned[rows], cost, np.inf))
-        best = np.argmin(costs, axis=0), np.arange(count)
-        guess = np.stack(guesses)[best]
-        lost = np.flatnonzero(np.stack(ends)[best] > BASIN)
+
+        def old(t: int, s: Floats) -> Floats:
+            return self._follow(s, rows, np.minimum(self.clock[rows] + t, horizon))
+
+        rolled = [self._roll_out(start, policy) for policy in (image(1.0), image(-1.0), old)]
+        actions, ends, costs = (np.stack(parts) for parts in zip(*rolled, strict=True))
+        costs[2, ~self.planned[rows]] = np.inf
+        best = costs.argmin(axis=0), np.arange(len(rows))
+        guess, lost = actions[best], np.flatnonzero(ends[best] > BASIN)
+        if len(lost):
+            smooth = self.smooth_planner.solve(start[lost], guess[lost])
+            guess[lost] = smooth.actions
+            lost = lost[known.upright_cost(smooth.states[:, -1]) > BASIN]
         for first in range(0, len(lost), PLANS_AT_ONCE // GUESSES):
             part = lost[first : first + PLANS_AT_ONCE // GUESSES]
-            found = search(self.system, start[part], known.horizon, known.upright_cost, GUESSES)
-            cheaper = found.cost < np.min(costs, axis=0)[part]
-            guess[part[cheaper]] = found.actions[cheaper]
+            found = search(self.planner.system, start[part], horizon, known.upright_cost, GUESSES)
+            guess[part] = found.actions
         return guess
 
     def _roll_out(self, start: Floats, policy: Policy) -> tuple[Floats, Floats, Floats]:
         """Actions (rows, T, 1), l_T of the last state (rows,), and the whole cost (rows,), of a policy(t, state)."""
-        state, cost = start, np.zeros(len(start))
-        actions = np.empty((len(start), self.known.horizon, self.system.n_action))
+        model, state, cost = self.planner.system, start, np.zeros(len(start))
+        actions = np.empty((len(start), self.known.horizon, model.n_action))
         for t in range(self.known.horizon):
-            actions[:, t] = self.system.clip(policy(t, state))
+            actions[:, t] = model.clip(policy(t, state))
             cost += self.stage_cost(state, actions[:, t])
-            state = self.system.flow(state, actions[:, t])
+            state = model.flow(state, actions[:, t])
         end = self.known.upright_cost(state)
         return actions, end, cost + end

@@ -144,4 +144,10 @@ TRIALS: tuple[Trial, ...] = (
         "beliefgym/BaxterReachHand-v0",
         Success("the hand within 1 cm of its target at the end", _hand_error_at_the_end, 1e-2, "m"),
     ),
+    *(
+        Trial(
+            env_id, Success("within 5 cm of the goal at the end", _distance_at_the_end("x", "y"), 0.05, "m")
+        )
+        for env_id in ("beliefgym/MobileBase-v0", "beliefgym/MobileBaseKinematic-v0")
+    ),
 )
