@@ -46,8 +46,7 @@ SMOOTH_TERMINAL = 20.0  # weight of l_T beside the smooth stage cost
 BASIN = (
     2.0  # l_T up to which the LQR at the upright catches (measured: all of 4000 states, with each actuation)
 )
-RESERVE = 0.9  # part of the drive that the known plan may use; the rest is left to its feedback
-NOISY_RESERVE = (
+RESERVE = 0.9  # part of the drive that plans may use where feedback needs the rest: the known plan, and all under noise
     0.9  # the same for the plans of the copies, of a system with noise; without noise they may use all
 )
 REPLAN_COST = 10.0
@@ -216,7 +215,7 @@ class DoublePendulumController:
             replace(system, process_noise_std=0.0, actuation_noise_std=0.0, start_spread=0.0)
         )
         self.stage_cost = LackOfReward(system)
-        share = NOISY_RESERVE if system.noise_size else 1.0
+        share = RESERVE if system.noise_size else 1.0
         self.planner = ILQR(
             system=replace(system, max_drive=share * system.max_drive),
             horizon=self.known.horizon,
