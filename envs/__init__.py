@@ -6,6 +6,7 @@ from beliefgym.envs.cart_pole import CartPole
 from beliefgym.envs.cart_pole_balance import CartPoleBalance
 from beliefgym.envs.catalogue import register_all
 from beliefgym.envs.collect import collect
+from beliefgym.envs.double_pendulum import DoublePendulum
 from beliefgym.envs.env import SystemEnv
 from beliefgym.envs.helicopter import Helicopter
 from beliefgym.envs.helicopter_competition import HelicopterCompetition
@@ -32,6 +33,7 @@ __all__ = [
     "BaxterReachHand",
     "CartPole",
     "CartPoleBalance",
+    "DoublePendulum",
     "HalfCheetahEnv",
     "Helicopter",
     "HelicopterCompetition",

@@ -36,6 +36,12 @@ def _pendulums() -> None:
         max_episode_steps=200,
         partial={"Position": ("x", "cos_theta", "sin_theta")},
     )
+    register_system(
+        "DoublePendulumSwingUp",
+        "beliefgym.envs.double_pendulum:DoublePendulum",
+        max_episode_steps=200,
+        partial={"Position": ("cos_theta_1", "sin_theta_1", "cos_theta_2", "sin_theta_2")},
+    )
 
 
 def _cart_pole_balancing() -> None:

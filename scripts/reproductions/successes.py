@@ -150,4 +150,13 @@ TRIALS: tuple[Trial, ...] = (
         )
         for env_id in ("beliefgym/MobileBase-v0", "beliefgym/MobileBaseKinematic-v0")
     ),
+    Trial(
+        "beliefgym/DoublePendulumSwingUp-v0",
+        Success(
+            "both links held upright for the last second",
+            _from_upright("theta_1", "theta_2", upright=np.pi),
+            0.2,
+            "rad",
+        ),
+    ),
 )
