@@ -1,11 +1,18 @@
-"""A differential-drive robot, the Videre Erratic of the thesis proposal (Sec. 3.2.3), that drives to a goal pose.
+"""A differential-drive base (Videre Erratic) that is to drive to a pose, with and without the lag of its motors.
 
-`MobileBaseKinematic` takes its commanded velocities at once (3 states), `MobileBase` lags behind them under limits of
-acceleration (5 states). Source of the constants: the published data of the Erratic and of its planner's settings.
+With pose (x, y, theta) in the goal's frame, speed v, turning rate w, commands v_c and w_c,
+
+    x' = v cos(theta),   y' = v sin(theta),   theta' = w
+    v' = clip((v_c - v) / lag, -a, a),        w' = clip((w_c - w) / lag, -b, b)
+
+for the base with a lag (integrated by RK4), and v = v_c, w = w_c for the kinematic one, whose arc is exact:
+
+    x <- x + v dt s cos(theta + w dt / 2),   y <- y + v dt s sin(theta + w dt / 2),   s = sin(w dt / 2) / (w dt / 2)
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,304 +27,273 @@ if TYPE_CHECKING:
     from beliefgym.envs.random_streams import RandomStreams
     from beliefgym.envs.rendering import Canvas
 
-LANDMARKS = ((2.5, 1.5), (-1.5, 2.5), (-0.5, -3.0))  # m, in the goal's frame
-POSE = ("x", "y", "cos_theta", "sin_theta")
-SIGHTINGS = (
-    *("range_1", "cos_bearing_1", "sin_bearing_1"),
-    *("range_2", "cos_bearing_2", "sin_bearing_2"),
-    *("range_3", "cos_bearing_3", "sin_bearing_3"),
-)
+WHEEL_SEPARATION, WHEEL_DIAMETER = 0.3305, 0.15  # m, of the Erratic
+WHEEL_SPEED = 1.0  # m/s, the firmware's limit
+N_LANDMARKS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class MobileBaseKinematic(System):
-    """A robot on two wheels that moves as it is told, and drives to a goal pose.
+    """A differential-drive base without inertia drives to a pose: the goal is the origin, heading along x.
 
-    With the goal at the origin, its heading along x, and the commands (v, omega) held for a period dt, the robot
-    drives an arc, which is integrated exactly (h = omega dt / 2):
+    The goal's frame is x forward, y left of the goal pose; the robot's frame is the same of the robot.
 
-        x' = x + v dt sinc(h) cos(theta + h),   y' = y + v dt sinc(h) sin(theta + h),   theta' = theta + omega dt
+    | # | state  | unit |   | #     | observation                                   | unit | range         |
+    |---|--------|------|   |-------|-----------------------------------------------|------|---------------|
+    | 0 | x      | m    |   | 0-1   | goal_forward, goal_left: in the robot's frame | m    |               |
+    | 1 | y      | m    |   | 2-3   | cos_theta, sin_theta                          | 1    | -1..1         |
+    | 2 | theta  | rad  |   | 4-5   | x, y                                          | m    |               |
+    |   |        |      |   | 6-8   | range_1, cos_bearing_1, sin_bearing_1         | m, 1 | 0.., -1..1    |
+    |   |        |      |   | 9-11  | range_2, cos_bearing_2, sin_bearing_2         | m, 1 | 0.., -1..1    |
+    |   |        |      |   | 12-14 | range_3, cos_bearing_3, sin_bearing_3         | m, 1 | 0.., -1..1    |
 
-    | # | state | unit |   | # | observation   | range (m)        |   | # | action    | range               |
-    |---|-------|------|   |---|---------------|------------------|   |---|-----------|---------------------|
-    | 0 | x     | m    |   | 0 | x             | unbounded        |   | 0 | speed     | -0.5..0.5 m/s       |
-    | 1 | y     | m    |   | 1 | y             | unbounded        |   | 1 | turn_rate | -1.745..1.745 rad/s |
-    | 2 | theta | rad  |   | 2 | cos_theta     | -1..1            |   |   |           |                     |
-    |   |       |      |   | 3 | sin_theta     | -1..1            |   |   |           |                     |
-    |   |       |      |   | . | range_i       | 0 and above      |   |   |           |                     |
-    |   |       |      |   | . | cos_bearing_i | -1..1            |   |   |           |                     |
-    |   |       |      |   | . | sin_bearing_i | -1..1            |   |   |           |                     |
+    | # | action     | range                          |
+    |---|------------|--------------------------------|
+    | 0 | speed      | -0.5..0.5 m/s                  |
+    | 1 | turning    | -1.745..1.745 rad/s (100 deg/s)|
 
-    The last three stand for each landmark, i = 1, 2, 3 (range_1, cos_bearing_1, sin_bearing_1, range_2, cos_bearing_2,
-    sin_bearing_2, range_3, cos_bearing_3, sin_bearing_3): its distance and its direction from the robot's heading. A
-    landmark outside the camera's field of view shows 0 in all three. Landmarks stand at (2.5, 1.5), (-1.5, 2.5) and
-    (-0.5, -3) m in the goal's frame.
+    A landmark outside of the field of view reads 0, 0, 0. The wheels then run at speed +- turning * separation / 2, at
+    most 0.79 m/s, which the firmware's limit of 1 m/s allows.
 
-    The thesis gives the goal in the robot's frame at the start. That is the same task in other coordinates:
-    `state_for_goal(ahead, left, turn)` is the start state for such a goal, `goal_in_robot_frame(state)` leads back.
+    Reward, in 0..1, of the state reached, with d the distance to the goal (chosen here):
 
-    Reward, in 0..1, of the state reached, with the distance r = (x^2 + y^2 + e^2)^(1/2) - e smoothed by e = 5 cm:
+        (0.7 + 0.3 (1 + cos theta)/2) / (1 + (d / 0.25 m)^2)
 
-        exp(-r / 1 m) (2 + cos theta) / 3
-
-    Start: at rest, anywhere within start_distance of the goal (uniform in the area), any heading. End: after 200
-    steps (20 s).
-
-    | id                                       | shows                                  |
-    |------------------------------------------|----------------------------------------|
-    | beliefgym/MobileBaseKinematic-v0         | x, y, cos_theta, sin_theta             |
-    | beliefgym/MobileBaseKinematicPosition-v0 | x, y: the heading shows in motion only |
-
+    Start: at rest, uniform in the disc of radius start_distance around the goal, any heading. End: after 200 steps.
     Versions: v0, the first.
 
-    The wheels turn at v +- omega wheel_separation / 2; a command that would drive one faster than max_wheel_speed is
-    scaled down as a whole, which keeps the curve. The source limits v and omega only; its firmware's 1 m/s straight
-    ahead is taken for the wheels' limit, which its limits of v and omega do not reach.
+    | id                                    | shows                                                       |
+    |---------------------------------------|-------------------------------------------------------------|
+    | beliefgym/MobileBaseKinematic-v0      | 0-3                                                         |
+    | beliefgym/MobileBase-v0               | 0-3, velocity and turn_rate (the base with a lag)           |
+    | beliefgym/MobileBaseNoisy-v0          | the same with odometry noise: 0.006 m, 0.051 rad            |
+    | beliefgym/MobileBasePosition-v0       | x, y: the position without the heading                      |
+    | beliefgym/MobileBaseLandmarks-v0      | 6-14: range and bearing of the landmarks in view            |
+    | beliefgym/MobileBaseLandmarksNoisy-v0 | the same with noise of 0.05 m and 0.05 rad (chosen)         |
 
-    Chosen here: dt, the goal's heading, the reward, the start, the length, the landmarks and the field of view.
+    Of the sources (erratic_robot, Videre's manual): wheels, limits, accelerations, odometry noise. Chosen here: dt,
+    lag, the actuation noise of 0.01 m/s and 0.03 rad/s, landmarks, field of view, start, length and reward.
 
     Args:
-        max_speed: m/s. max_turn_rate: rad/s. max_wheel_speed: m/s. wheel_separation: m. wheel_diameter: m (drawn only).
-        start_distance: m. field_of_view: rad, of the camera that sees landmarks; 2 pi sees all round.
+        max_speed: m/s. max_turning: rad/s.
+        start_distance: m.
+        landmarks: ((x, y), ...) in m in the goal's frame, three of them.
+        field_of_view: rad, the whole angle in which landmarks are seen, around straight ahead.
 
-    Reference: thesis proposal, Sec. 3.2.3 (Videre Erratic).
+    Reference: thesis proposal, Sec. 3.2.3 (Videre Erratic: state 3, control 2).
     """
 
     dt: float = 0.1
+    actuation_noise_std: float | tuple[float, ...] = (0.01, 0.03)
     max_speed: float = 0.5
-    max_turn_rate: float = float(np.deg2rad(100.0))
-    max_wheel_speed: float = 1.0
-    wheel_separation: float = 0.3305
-    wheel_diameter: float = 0.15
+    max_turning: float = math.radians(100.0)
     start_distance: float = 3.0
-    field_of_view: float = float(np.deg2rad(120.0))
+    landmarks: tuple[tuple[float, float], ...] = ((2.5, 1.5), (2.5, -1.5), (-2.5, 0.0))
+    field_of_view: float = math.pi
 
     state_names: ClassVar[tuple[str, ...]] = ("x", "y", "theta")
-    action_names: ClassVar[tuple[str, ...]] = ("speed", "turn_rate")
-    observation_names: ClassVar[tuple[str, ...]] = (*POSE, *SIGHTINGS)
+    action_names: ClassVar = ("speed", "turning")
+    observation_names: ClassVar[tuple[str, ...]] = (
+        *("goal_forward", "goal_left", "cos_theta", "sin_theta", "x", "y"),
+        *(
+            f"{kind}_{k}"
+            for k in range(1, N_LANDMARKS + 1)
+            for kind in ("range", "cos_bearing", "sin_bearing")
+        ),
+    )
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "landmarks", tuple((float(x), float(y)) for x, y in self.landmarks))
         super().__post_init__()
-        positive = ("max_speed", "max_turn_rate", "max_wheel_speed", "wheel_separation", "wheel_diameter")
-        for name in (*positive, "start_distance", "field_of_view"):
+        for name in ("max_speed", "max_turning", "start_distance", "field_of_view"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"expected {name} above 0, got {getattr(self, name)!r}")
-        if self.field_of_view > 2.0 * np.pi:
-            raise ValueError(f"expected field_of_view of at most 2 pi rad, got {self.field_of_view!r}")
+        if len(self.landmarks) != N_LANDMARKS:
+            raise ValueError(f"expected {N_LANDMARKS} landmarks (x, y), got {len(self.landmarks)}")
+        fastest = self.max_speed + 0.5 * WHEEL_SEPARATION * self.max_turning
+        if fastest > WHEEL_SPEED:
+            raise ValueError(
+                f"expected limits that the wheels can follow (at most {WHEEL_SPEED:g} m/s), but max_speed and "
+                f"max_turning together ask for {fastest:.3g} m/s"
+            )
 
     @property
     def action_limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Limits of the commanded speed in m/s and turn rate in rad/s."""
-        high = np.array([self.max_speed, self.max_turn_rate])
+        """Speed in m/s and turning rate in rad/s."""
+        high = np.array([self.max_speed, self.max_turning])
         return -high, high
 
     @property
     def observation_limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Cosines and sines are bounded, ranges are at least 0."""
+        """Cosines and sines are within -1..1, ranges at least 0."""
         names = self.observation_names
-        high = np.array([1.0 if name.startswith(("cos", "sin")) else np.inf for name in names])
-        return np.where([name.startswith("range") for name in names], 0.0, -high), high
+        turns = [name.startswith(("cos", "sin")) for name in names]
+        high = np.where(turns, 1.0, np.inf)
+        low = np.where([name.startswith("range") for name in names], 0.0, -high)
+        return low, high
 
     def flow(self, state: Array, action: Array, disturbance: Array | None = None) -> Array:
-        """See `System.flow`."""
+        """The exact arc of constant speed and turning rate."""
         xp = array_namespace(state)
-        speed, turn_rate = self._within_the_wheels_limit(action)
-        half = (0.5 * self.dt) * turn_rate
-        small = xp.abs(half) < 1e-3
-        chord = xp.where(small, 1.0 - half * half / 6.0, xp.sin(half) / xp.where(small, 1.0 + 0.0 * half, half))
-        chord = chord * speed * self.dt
-        middle = state[..., 2] + half
-        x, y = state[..., 0] + chord * xp.cos(middle), state[..., 1] + chord * xp.sin(middle)
-        return xp.stack([x, y, middle + half], axis=-1)
+        x, y, theta = state[..., 0], state[..., 1], state[..., 2]
+        path, half = self.dt * action[..., 0], (0.5 * self.dt) * action[..., 1]
+        straight = xp.abs(half) < 1e-4
+        safe = xp.where(straight, xp.ones_like(half), half)
+        chord = path * xp.where(straight, 1.0 - half * half * (1.0 / 6.0), xp.sin(safe) / safe)
+        middle = theta + half
+        return xp.stack([x + chord * xp.cos(middle), y + chord * xp.sin(middle), theta + 2.0 * half], axis=-1)
 
     def observe(self, state: Array) -> Array:
-        """The pose, then the sightings of the landmarks."""
-        return array_namespace(state).stack(self._pose_and_sightings(state), axis=-1)
+        """Goal, heading, position and landmarks; see the class."""
+        return array_namespace(state).stack(self._seen(state), axis=-1)
+
+    def _seen(self, state: Array) -> list[Array]:
+        xp = array_namespace(state)
+        x, y, theta = state[..., 0], state[..., 1], state[..., 2]
+        c, s = xp.cos(theta), xp.sin(theta)
+        seen = [-(c * x + s * y), s * x - c * y, c, s, x, y]
+        for landmark_x, landmark_y in self.landmarks:
+            dx, dy = landmark_x - x, landmark_y - y
+            distance = xp.sqrt(dx * dx + dy * dy)
+            far = xp.maximum(distance, 1e-9 + 0.0 * distance)
+            ahead, left = (c * dx + s * dy) / far, (c * dy - s * dx) / far
+            # at full angle the cosine of the half angle is -1, and the rounding of a unit vector is not to hide it
+            visible = ahead >= math.cos(0.5 * min(self.field_of_view, 2 * math.pi)) - 1e-9
+            nothing = 0.0 * distance
+            seen += [xp.where(visible, value, nothing) for value in (distance, ahead, left)]
+        return seen
 
     def reward(self, state: Array, action: Array, next_state: Array) -> Array:
-        """Near and aligned; in 0..1; see the class."""
+        """Near the goal, and turned as the goal is; in 0..1; see the class."""
         xp = array_namespace(next_state)
-        x, y = next_state[..., 0], next_state[..., 1]
-        distance = xp.sqrt(x * x + y * y + SMOOTHED**2) - SMOOTHED
-        return xp.exp(-distance) * (2.0 + xp.cos(next_state[..., 2])) * (1.0 / 3.0)
+        x, y, theta = next_state[..., 0], next_state[..., 1], next_state[..., 2]
+        return (0.7 + 0.15 * (1.0 + xp.cos(theta))) / (1.0 + (x * x + y * y) * 16.0)
 
     def stage_cost(self, state: Array, action: Array) -> Array:
-        """A smooth cost that leads to the reward: x^2 + y^2 + (1 - cos theta) / 2, and a little for the commands."""
+        """A smooth cost that leads to the reward: x^2 + y^2 + (1 - cos theta) / 2 + v_c^2 / 10 + w_c^2 / 100."""
         xp = array_namespace(state)
-        x, y = state[..., 0], state[..., 1]
-        v, w = action[..., 0] * (1.0 / self.max_speed), action[..., 1] * (1.0 / self.max_turn_rate)
-        return x * x + y * y + 0.5 * (1.0 - xp.cos(state[..., 2])) + 0.01 * (v * v + w * w)
+        x, y, theta = state[..., 0], state[..., 1], state[..., 2]
+        speed, turning = action[..., 0], action[..., 1]
+        return (
+            x * x + y * y + 0.5 * (1.0 - xp.cos(theta)) + 0.1 * (speed * speed) + 0.01 * (turning * turning)
+        )
 
     def initial_state(
         self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None
     ) -> NDArray[np.float64]:
-        """At rest, uniform in the disc of start_distance about the goal, any heading."""
+        """At rest, uniform in the disc, any heading."""
         drawn = streams.uniform(3, mask)
-        distance, direction = self.start_distance * np.sqrt(drawn[:, 0]), 2.0 * np.pi * drawn[:, 1]
+        distance, angle = self.start_distance * np.sqrt(drawn[:, 0]), 2.0 * np.pi * drawn[:, 1]
         state = np.zeros((len(drawn), self.n_state))
-        state[:, 0], state[:, 1] = distance * np.cos(direction), distance * np.sin(direction)
+        state[:, 0], state[:, 1] = distance * np.cos(angle), distance * np.sin(angle)
         state[:, 2] = np.pi * (2.0 * drawn[:, 2] - 1.0)
         return state
 
-    def state_for_goal(self, ahead: float, left: float, turn: float = 0.0) -> NDArray[np.float64]:
-        """The state, at rest, of a robot that sees its goal in its own frame: (n_state,).
-
-        Args:
-            ahead: m, along the robot's heading. left: m, across it.
-            turn: rad, from the robot's heading to the goal's.
-        """
-        c, s = np.cos(turn), np.sin(turn)
-        state = np.zeros(self.n_state)
-        state[:3] = -c * ahead - s * left, s * ahead - c * left, -turn
-        return state
-
-    def goal_in_robot_frame(self, state: Array) -> Array:
-        """The goal's place in the robot's frame and the turn to its heading: (..., n_state) -> (..., 3)."""
-        xp = array_namespace(state)
-        x, y, theta = state[..., 0], state[..., 1], state[..., 2]
-        c, s = xp.cos(theta), xp.sin(theta)
-        return xp.stack([-c * x - s * y, s * x - c * y, -theta], axis=-1)
-
     def expert(self) -> Any:
-        """Iterative LQR on the true model about curves of a polar control law, tracked by its gains."""
+        """A stabilising law in polar coordinates, driving forwards or backwards; see planning/mobile_base.py."""
         from beliefgym.envs.planning.mobile_base import mobile_base_expert
 
         return mobile_base_expert(self)
 
-    def _within_the_wheels_limit(self, action: Array) -> tuple[Array, Array]:
-        """Commanded speed and turn rate, scaled down where a wheel would turn too fast."""
-        xp = array_namespace(action)
-        speed, turn_rate = action[..., 0], action[..., 1]
-        fastest = xp.abs(speed) + (0.5 * self.wheel_separation) * xp.abs(turn_rate)
-        share = self.max_wheel_speed / xp.where(
-            fastest > self.max_wheel_speed, fastest, self.max_wheel_speed + 0.0 * fastest
-        )
-        return speed * share, turn_rate * share
-
-    def _pose_and_sightings(self, state: Array) -> list[Array]:
-        xp = array_namespace(state)
-        x, y, theta = state[..., 0], state[..., 1], state[..., 2]
-        c, s = xp.cos(theta), xp.sin(theta)
-        parts = [x, y, c, s]
-        edge = float(np.cos(0.5 * self.field_of_view))
-        for mark_x, mark_y in LANDMARKS:
-            dx, dy = mark_x - x, mark_y - y
-            distance = xp.sqrt(dx * dx + dy * dy + 1e-18)  # keeps the direction finite on the landmark itself
-            ahead, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance
-            parts += [xp.where(ahead >= edge, part, 0.0 * part) for part in (distance, ahead, left)]
-        return parts
-
     def draw(self, canvas: Canvas, state: NDArray[np.float64], action: NDArray[np.float64] | None) -> None:
-        """The goal pose, the landmarks (green where they are seen) and the field of view, and the robot."""
-        canvas.view(center=(0.0, 0.0), width=2.0 * self.start_distance + 2.0)
+        """Goal pose, landmarks (filled where seen), the robot with its wheels, and its command."""
         x, y, theta = (float(value) for value in state[:3])
-        seen = np.asarray(self.observe(state[None]))[0, -len(SIGHTINGS) :: 3] > 0.0
-        if self.field_of_view < 2.0 * np.pi:
-            for side in (-0.5, 0.5):
-                edge = theta + side * self.field_of_view
-                canvas.line((x, y), (x + 12.0 * np.cos(edge), y + 12.0 * np.sin(edge)), 0.015, "guide")
-        for (mark_x, mark_y), visible in zip(LANDMARKS, seen, strict=True):
-            canvas.circle((mark_x, mark_y), 0.13, "target" if visible else "faint")
-        canvas.circle((0.0, 0.0), 0.3, "target", width=0.04)
+        canvas.view(center=(0.0, 0.0), width=2.0 * self.start_distance + 1.0)
+        seen = np.asarray(self.observe(state))[6:15:3] > 0.0
+        for (landmark_x, landmark_y), visible in zip(self.landmarks, seen, strict=True):
+            if visible:
+                canvas.line((x, y), (landmark_x, landmark_y), 0.02, "guide")
+            canvas.circle((landmark_x, landmark_y), 0.12, "joint" if visible else "guide")
+        canvas.circle((0.0, 0.0), 0.3, "target", 0.04)
         canvas.arrow((0.0, 0.0), (0.55, 0.0), 0.05, "target")
-        self._draw_robot(canvas, x, y, theta)
-        if action is not None:
-            reach = 0.7 * float(action[0]) / self.max_speed
-            tip = (x + reach * np.cos(theta), y + reach * np.sin(theta))
-            canvas.arrow((x, y), tip, 0.05, "force")
-            canvas.turn_arrow((x, y), 0.33, -0.6 * float(action[1]) / self.max_turn_rate, "force")
-
-    def _draw_robot(self, canvas: Canvas, x: float, y: float, theta: float) -> None:
-        """Body, two wheels and a nose that shows the heading."""
-        forward, left = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
+        heading, side = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
         center = np.array([x, y])
-
-        def at(ahead: float, across: float) -> tuple[float, float]:
-            place = center + ahead * forward + across * left
-            return float(place[0]), float(place[1])
-
-        half, wheel = 0.5 * self.wheel_separation, 0.5 * self.wheel_diameter
-        canvas.rod(at(-0.1, 0.0), at(0.1, 0.0), 1.7 * half, "body")
-        for across in (-half, half):
-            canvas.line(at(-wheel, across), at(wheel, across), 0.05, "joint")
-        canvas.circle(at(0.15, 0.0), 0.045, "background")
+        for sign in (-1.0, 1.0):
+            wheel = center + sign * (0.5 * WHEEL_SEPARATION + 0.04) * side
+            canvas.line(_point(wheel - 0.11 * heading), _point(wheel + 0.11 * heading), 0.07, "joint")
+        canvas.circle((x, y), 0.18, "body")
+        canvas.line((x, y), _point(center + 0.17 * heading), 0.05, "background")
+        if action is not None:
+            reach = 0.18 + 0.6 * abs(float(action[0])) / self.max_speed
+            tip = center + np.sign(action[0]) * reach * heading
+            canvas.arrow(_point(center + np.sign(action[0]) * 0.18 * heading), _point(tip), 0.05, "force")
+            canvas.turn_arrow((x, y), 0.32, -0.5 * float(action[1]) / self.max_turning, "force")
 
 
 @dataclass(frozen=True, kw_only=True)
 class MobileBase(MobileBaseKinematic):
-    """A robot on two wheels that lags behind its commands, and drives to a goal pose.
+    """A differential-drive base whose motors follow the commands with a lag drives to a pose.
 
-    With the goal at the origin, its heading along x, and the commands (v_c, omega_c) held for a period dt,
+    `MobileBaseKinematic` says all but this: the state has two more components,
 
-        dx/dt = v cos(theta)      dv/dt     = clip((v_c - v) / lag, -max_acceleration, max_acceleration)
-        dy/dt = v sin(theta)      domega/dt = clip((omega_c - omega) / lag, -max_turn_..., max_turn_acceleration)
-        dtheta/dt = omega,        integrated by RK4.
+    | # | state     | unit  |   | #  | observation | unit  |
+    |---|-----------|-------|   |----|-------------|-------|
+    | 3 | velocity  | m/s   |   | 15 | velocity    | m/s   |
+    | 4 | turn_rate | rad/s |   | 16 | turn_rate   | rad/s |
 
-    | # | state            | unit  |   | # | observation      | range       |   | # | action    | range               |
-    |---|------------------|-------|---|---|------------------|-------------|---|---|-----------|---------------------|
-    | 0 | x                | m     |   | 0 | x                | unbounded   |   | 0 | speed     | -0.5..0.5 m/s       |
-    | 1 | y                | m     |   | 1 | y                | unbounded   |   | 1 | turn_rate | -1.745..1.745 rad/s |
-    | 2 | theta            | rad   |   | 2 | cos_theta        | -1..1       |   |   |           |                     |
-    | 3 | velocity         | m/s   |   | 3 | sin_theta        | -1..1       |   |   |           |                     |
-    | 4 | angular_velocity | rad/s |   | 4 | velocity         | unbounded   |   |   |           |                     |
-    |   |                  |       |   | 5 | angular_velocity | unbounded   |   |   |           |                     |
-    |   |                  |       |   | . | range_i          | 0 and above |   |   |           |                     |
-    |   |                  |       |   | . | cos_bearing_i    | -1..1       |   |   |           |                     |
-    |   |                  |       |   | . | sin_bearing_i    | -1..1       |   |   |           |                     |
+    which follow the commands speed and turning by a first-order lag within the accelerations that the base's planner
+    uses, 2.5 m/s^2 and 3.2 rad/s^2 (of the source; the lag of 0.15 s is chosen). The others are
 
-    The last three stand for each landmark, i = 1, 2, 3 (range_1, cos_bearing_1, sin_bearing_1, range_2, cos_bearing_2,
-    sin_bearing_2, range_3, cos_bearing_3, sin_bearing_3). Landmarks, field of view, wheels, reward, start, and the
-    goal in the robot's frame are those of `MobileBaseKinematic`, whose data sheet says what was chosen. The episode
-    ends after 200 steps (20 s).
+    x, y, theta; goal_forward, goal_left, cos_theta, sin_theta; range_k, cos_bearing_k, sin_bearing_k of the landmarks:
+    range_1, cos_bearing_1, sin_bearing_1, range_2, cos_bearing_2, sin_bearing_2, range_3, cos_bearing_3, sin_bearing_3.
 
-    | id                               | shows                                                                  |
-    |----------------------------------|------------------------------------------------------------------------|
-    | beliefgym/MobileBase-v0          | x, y, cos_theta, sin_theta, velocity, angular_velocity                 |
-    | beliefgym/MobileBasePosition-v0  | x, y: heading and speeds show in motion only                           |
-    | beliefgym/MobileBaseLandmarks-v0 | the landmarks' ranges and bearings: mostly none or one is in view, so  |
-    |                                  | that the pose must be pieced together                                  |
-
-    Versions: v0, the first. The lag was chosen here; the source has none.
+    Versions: v0, the first.
 
     Args:
-        lag: s, of the first-order approach to the commands.
-        max_acceleration: m/s^2. max_turn_acceleration: rad/s^2. The others: see `MobileBaseKinematic`.
+        lag: s, of both motors. max_acceleration: m/s^2. max_turning_acceleration: rad/s^2.
 
-    Reference: thesis proposal, Sec. 3.2.3 (Videre Erratic).
+    Reference: thesis proposal, Sec. 3.2.3.
     """
 
-    lag: float = 0.25
+    lag: float = 0.15
     max_acceleration: float = 2.5
-    max_turn_acceleration: float = 3.2
+    max_turning_acceleration: float = 3.2
 
-    state_names: ClassVar[tuple[str, ...]] = ("x", "y", "theta", "velocity", "angular_velocity")
-    observation_names: ClassVar[tuple[str, ...]] = (*POSE, "velocity", "angular_velocity", *SIGHTINGS)
+    state_names: ClassVar[tuple[str, ...]] = (*MobileBaseKinematic.state_names, "velocity", "turn_rate")
+    observation_names: ClassVar[tuple[str, ...]] = (
+        *MobileBaseKinematic.observation_names,
+        "velocity",
+        "turn_rate",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("lag", "max_acceleration", "max_turn_acceleration"):
+        for name in ("lag", "max_acceleration", "max_turning_acceleration"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"expected {name} above 0, got {getattr(self, name)!r}")
+                raise ValueError(
+                    f"expected {name} above 0, got {getattr(self, name)!r} (without a lag: MobileBaseKinematic)"
+                )
 
-    def derivative(self, state: Array, command: Array) -> Array:
-        """Time derivative of the state, (..., 5), under commands (..., 2) that the wheels can follow."""
+    def derivative(self, state: Array, action: Array) -> Array:
+        """Time derivative of the state, (..., 5), under commands (..., 2)."""
         xp = array_namespace(state)
-        theta, v, w = state[..., 2], state[..., 3], state[..., 4]
-        a, b = self.max_acceleration, self.max_turn_acceleration
-        speed_up = xp.clip((command[..., 0] - v) * (1.0 / self.lag), -a, a)
-        turn_up = xp.clip((command[..., 1] - w) * (1.0 / self.lag), -b, b)
-        return xp.stack([v * xp.cos(theta), v * xp.sin(theta), w, speed_up, turn_up], axis=-1)
+        theta, velocity, rate = state[..., 2], state[..., 3], state[..., 4]
+        pull = (action[..., 0] - velocity) / self.lag
+        turn = (action[..., 1] - rate) / self.lag
+        return xp.stack(
+            [
+                velocity * xp.cos(theta),
+                velocity * xp.sin(theta),
+                rate,
+                _limited(pull, self.max_acceleration),
+                _limited(turn, self.max_turning_acceleration),
+            ],
+            axis=-1,
+        )
 
     def flow(self, state: Array, action: Array, disturbance: Array | None = None) -> Array:
-        """See `System.flow`."""
-        command = array_namespace(state).stack(list(self._within_the_wheels_limit(action)), axis=-1)
-        return rk4(self.derivative, state, command, self.dt)
+        """RK4 over one control period."""
+        return rk4(self.derivative, state, action, self.dt)
 
-    def observe(self, state: Array) -> Array:
-        """The pose, the velocities, then the sightings of the landmarks."""
-        parts = self._pose_and_sightings(state)
-        parts[len(POSE) : len(POSE)] = [state[..., 3], state[..., 4]]
-        return array_namespace(state).stack(parts, axis=-1)
+    def _seen(self, state: Array) -> list[Array]:
+        return [*super()._seen(state), state[..., 3], state[..., 4]]
 
 
-SMOOTHED = 0.05  # m; e of the reward
+def _limited(value: Array, limit: float) -> Array:
+    xp = array_namespace(value)
+    most = limit + 0.0 * value
+    return xp.minimum(xp.maximum(value, -most), most)
+
+
+def _point(vector: NDArray[np.float64]) -> tuple[float, float]:
+    return float(vector[0]), float(vector[1])

@@ -46,8 +46,8 @@ SMOOTH_TERMINAL = 20.0  # weight of l_T beside the smooth stage cost
 BASIN = (
     2.0  # l_T up to which the LQR at the upright catches (measured: all of 4000 states, with each actuation)
 )
-RESERVE = 0.9  # part of the drive that plans may use where feedback needs the rest: the known plan, and all under noise
-    0.9  # the same for the plans of the copies, of a system with noise; without noise they may use all
+RESERVE = (
+    0.9  # share of the drive that plans may use where feedback needs the rest: the known one, all under noise
 )
 REPLAN_COST = 10.0
 PLANS_AT_ONCE = 256  # bounds the memory
@@ -216,8 +216,9 @@ class DoublePendulumController:
         )
         self.stage_cost = LackOfReward(system)
         share = RESERVE if system.noise_size else 1.0
+        self.model = replace(system, max_drive=share * system.max_drive)
         self.planner = ILQR(
-            system=replace(system, max_drive=share * system.max_drive),
+            system=self.model,
             horizon=self.known.horizon,
             stage_cost=self.stage_cost,
             terminal_cost=self.known.upright_cost,
@@ -323,7 +324,7 @@ class DoublePendulumController:
             lost = lost[known.upright_cost(smooth.states[:, -1]) > BASIN]
         for first in range(0, len(lost), PLANS_AT_ONCE // GUESSES):
             part = lost[first : first + PLANS_AT_ONCE // GUESSES]
-            found = search(self.planner.system, start[part], horizon, known.upright_cost, GUESSES)
+            found = search(self.model, start[part], horizon, known.upright_cost, GUESSES)
             guess[part] = found.actions
         return guess
 

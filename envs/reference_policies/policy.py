@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 FORMAT = 1
 ACTIVATIONS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
@@ -110,7 +110,7 @@ class MLPPolicy:
             "about": dict(self.about),
         }
         temporary = base.with_name(base.name + ".tmp")
-        save_file({name: np.ascontiguousarray(value) for name, value in numbers.items()}, temporary)
+        temporary.write_bytes(save({name: np.ascontiguousarray(value) for name, value in numbers.items()}))
         os.replace(temporary, base.with_name(base.name + ".safetensors"))
         temporary.write_text(json.dumps(header, indent=1) + "\n")
         os.replace(temporary, base.with_name(base.name + ".json"))
