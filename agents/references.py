@@ -82,9 +82,11 @@ def measure(task: Task | str, n_episodes: int = N_EPISODES) -> References:
 
 
 def measure_all(env_ids: Iterable[str], path: Path = PATH, told: Callable[[str], None] = print) -> None:
-    """Measure the references of the given environments and write the table; what it says of others stays."""
-    kept = json.loads(path.read_text())["references"] if path.exists() else {}
-    table = {env_id: kept[env_id] for env_id in registered_ids() if env_id in kept}
+    """Measure the references of the given environments and write the table; what it says of others stays.
+
+    The table is read and written anew after each environment, so that nothing measured is lost to an interruption or to
+    another process that measures other environments.
+    """
     measured: dict[Any, References] = {}
     for env_id in env_ids:
         key = _what_decides_returns(env_id)
@@ -92,13 +94,14 @@ def measure_all(env_ids: Iterable[str], path: Path = PATH, told: Callable[[str],
             measured[key] = measure(env_id)
         found = measured[key]
         told(f"{env_id}: random {found.random:.1f}, expert {found.expert:.1f}")
+        table = json.loads(path.read_text())["references"] if path.exists() else {}
         table[env_id] = {name: round(value, 4) for name, value in vars(found).items()}
-    table = dict(sorted(table.items()))
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(
-        json.dumps({"n_episodes": N_EPISODES, "seed": SEED, "references": table}, indent=1) + "\n"
-    )
-    os.replace(temporary, path)
+        known = {name: table[name] for name in registered_ids() if name in table}  # sorted
+        temporary = path.with_suffix(".tmp")
+        temporary.write_text(
+            json.dumps({"n_episodes": N_EPISODES, "seed": SEED, "references": known}, indent=1) + "\n"
+        )
+        os.replace(temporary, path)
     _table.cache_clear()
 
 

@@ -1,8 +1,8 @@
 """Double pendulum swing-up: bring two links that hang from a motor above it, one upon the other, and hold them.
 
-The equations of motion are those of LAIRLAB's control simulators (thesis proposal, Sec. 3.1.3, names the systems that
-they were written for): point masses at the ends of two massless rods, both angles measured from the vertical. They
-were checked against Lagrange's equations and hold without a correction.
+The equations of motion are those of LAIRLAB's control simulators, which the thesis proposal's Sec. 3.2.3 points to (it
+shows no experiment on this one): point masses at the ends of two massless rods, both angles measured from the
+vertical. They were checked against Lagrange's equations and hold without a correction.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class DoublePendulum(System):
         start_spread: SI units of each component.
         substeps: of RK4 in one control period.
 
-    Reference: LAIRLAB control_simulators (equations and constants); thesis proposal, Sec. 3.1.3.
+    Reference: LAIRLAB control_simulators (equations and constants); thesis proposal, Sec. 3.2.3, footnote 3.
     """
 
     length_1: float = 1.0

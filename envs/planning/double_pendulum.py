@@ -4,17 +4,21 @@ It minimises what the reward lacks of its highest value 1,
 
     l(s, u) = 1 - r(s, u),      l_T(s) = d' P d / 2,      d = s - upright, with both angles in [-pi, pi),
 
-with P, K of the infinite-horizon LQR at the upright. l alone is too flat to find a way up by. So a plan for a state
-that no known plan serves is searched for with the system's smooth stage cost: iLQR from many random bang-bang first
-guesses (of a fixed seed) on a model with one substep; the best of these ends are polished on the true model, first
-with the smooth cost and then with l. One such plan, from hanging at rest, is found for each set of parameters and
-kept in memory; it and its mirror image, followed with their gains, serve the start states. Each copy then has iLQR
-fit the better one to its own start. u_t + K_t (s - s_t) is applied until the plan ends, K d afterwards. A copy plans
-anew when a new episode begins, and when the expected loss of its deviation from the plan,
+with P, K of the infinite-horizon LQR at the upright. l alone is too flat to find a way up by. So one plan, from
+hanging at rest, is searched for with the system's smooth stage cost c and kept in memory for each set of parameters:
+iLQR from many random bang-bang first guesses (of a fixed seed) on a model with one substep; the best are polished on
+the true model, first with c and then with l. It may use a part of the drive only, so that feedback along it has room.
 
-    (s - s_t)' V_t (s - s_t) / 2,      V_t = l_ss + K_t' l_uu K_t + (A + B K_t)' V_{t+1} (A + B K_t),  V_T = P,
+A copy's own plan begins with the known one or its mirror image, whichever ends better from the copy's start, and iLQR
+fits it to l with the whole drive. Where neither ends near the upright, iLQR with c comes between, and where that
+fails too, a search from that state. The copy then follows its plan by
 
-is above a threshold; what is left of the old plan is then one of the guesses.
+    u_t + K_t (s - s_t),   K_t = -(c_uu + B' V_{t+1} B)^-1 B' V_{t+1} A,
+    V_t = c_ss + K_t' c_uu K_t + (A + B K_t)' V_{t+1} (A + B K_t),   V_T = P,
+
+which, unlike iLQR's own gains, do not vanish where the plan is at a limit; K d after its end. It plans anew when a
+new episode begins, and when (s - s_t)' V_t (s - s_t) / 2, what its deviation is expected to cost, is above a
+threshold; what is left of the old plan is then one of the guesses.
 """
 
 from __future__ import annotations
@@ -43,13 +47,11 @@ HELD_FOR = (1 / 3, 9 / 10)  # shortest and longest hold of a random guess, in th
 LIBRARY_GUESSES, GUESSES = 64, 16  # random first guesses, for the plan from hanging and for another state
 KEEP = 6  # of these are polished
 SMOOTH_TERMINAL = 20.0  # weight of l_T beside the smooth stage cost
-BASIN = (
-    2.0  # l_T up to which the LQR at the upright catches (measured: all of 4000 states, with each actuation)
-)
+BASIN = 2.0  # l_T up to which the LQR at the upright catches: over 99.5 % of 4000 states, with each actuation
 RESERVE = (
     0.9  # share of the drive that plans may use where feedback needs the rest: the known one, all under noise
 )
-REPLAN_COST = 10.0
+REPLAN_COST = 10.0  # in units of the smooth cost
 PLANS_AT_ONCE = 256  # bounds the memory
 
 
