@@ -42,7 +42,7 @@ def test_the_arc_is_the_integral_of_the_unicycle():
 
 def test_the_lag_follows_its_equations():
     """Written again as a function of time, with the accelerations limited."""
-    system = MobileBase(dt=0.01)  # RK4's error at the corner where the limit lets go is of the order of dt^2: 2e-5 at most here
+    system = MobileBase(dt=0.01)  # RK4's error at the corner where the limit lets go is of the order of dt^2
     state, action = visited(system, steps=40)
     found = system.flow(state, action)
 
@@ -54,7 +54,7 @@ def test_the_lag_follows_its_equations():
         solution = solve_ivp(
             derivative, (0.0, 0.01), start, args=(command,), rtol=1e-10, atol=1e-12, max_step=5e-4
         )
-        assert end == pytest.approx(solution.y[:, -1], abs=5e-5)
+        assert end == pytest.approx(solution.y[:, -1], abs=5e-5)  # 2e-5 was seen
 
 
 def test_accelerations_and_speeds_stay_within_the_limits():
