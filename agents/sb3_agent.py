@@ -28,6 +28,7 @@ from beliefgym.wrappers.sb3 import SB3VecEnv
 from beliefgym.wrappers.task import Task
 
 ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN", "RecurrentPPO", "TQC", "CrossQ")
+_CONTINUOUS = ("SAC", "TD3", "DDPG", "TQC", "CrossQ")
 _ACTIVATIONS = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
 
 
@@ -88,7 +89,8 @@ class SB3Agent(Agent):
         tensorboard_log: folder for TensorBoard, in SB3's layout; None for none.
 
     Raises:
-        ValueError: an unknown algorithm, or an observation that cannot be stacked.
+        ValueError: an unknown algorithm, an action space that it cannot act in, or an observation that cannot be
+            stacked.
     """
 
     def __init__(
@@ -106,6 +108,11 @@ class SB3Agent(Agent):
         super().__init__(task, seed)
         if algorithm not in ALGORITHMS:
             raise ValueError(f"expected algorithm to be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
+        if algorithm in _CONTINUOUS and not isinstance(self.action_space, Box):
+            raise ValueError(
+                f"{algorithm} acts in a Box of continuous actions, but {self.task.label} has {self.action_space}; "
+                "take PPO, A2C, RecurrentPPO or DQN"
+            )
         if n_stack > 1:
             require_box(self.observation_space, "a stack of frames")
         self.algorithm = algorithm

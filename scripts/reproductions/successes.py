@@ -62,6 +62,14 @@ def _distance_at_the_end(*names: str) -> Callable[[Any, Floats], Floats]:
 _POSITION = ("position_north", "position_east", "position_down")
 
 
+def _funnel_error_at_the_end(system: Any, states: Floats) -> Floats:
+    """How far the helicopter is from its place on the funnel in the last state."""
+    names = [f"position_error_{axis}" for axis in ("forward", "right", "down")]
+    columns = [system.observation_names.index(name) for name in names]
+    distance: Floats = np.linalg.norm(system.observe(states[-1])[..., columns], axis=-1)
+    return distance
+
+
 def _lag_at_the_end(system: Any, states: Floats) -> Floats:
     """How far the joint that is farthest from its reference is from it in the last state."""
     lag: Floats = np.abs(system.tracking_error(states[-1])).max(axis=-1)
@@ -124,6 +132,16 @@ TRIALS: tuple[Trial, ...] = (
     Trial("beliefgym/HelicopterHover-v0", _HOVERS, {"wrench_noise_std": 0.1}),
     Trial("beliefgym/HelicopterHover-v0", _HOVERS),
     Trial("beliefgym/HelicopterHover-v0", _HOVERS, {"expert_effort": 0.02, "max_change": 1.0}),
+    Trial(
+        "beliefgym/HelicopterFunnel-v0",
+        Success("within 0.5 m of its target at the end of the funnel", _funnel_error_at_the_end, 0.5, "m"),
+    ),
+    Trial(
+        "beliefgym/HelicopterCompetition-v0",
+        Success(
+            "in the air for 6000 steps, within 1 m at the end", _distance_at_the_end(*_POSITION), 1.0, "m"
+        ),
+    ),
     Trial(
         "beliefgym/MicoLift-v0",
         Success("every joint within 0.01 rad of the lift's end", _lag_at_the_end, 1e-2, "rad"),
