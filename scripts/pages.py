@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from beliefgym.agents import make_agent
 from beliefgym.agents.references import references
 from beliefgym.envs import registered_ids
+from beliefgym.scripts.leaderboard.tiers import TIERS
 from beliefgym.scripts.named_record import markdown_table
 from beliefgym.wrappers.components import component_names
 from beliefgym.wrappers.task import Task
@@ -51,6 +52,7 @@ def write_pages(docs: Path, results: Path, told: Callable[[str], None] = print) 
         save_picture(strip(shown_id(ids)), pictures / f"{name}.png")
         (pages / f"{name}.md").write_text(page(name, ids, without_memory))
         index.append([f"[{name}]({name}.md)", headline(ids[0]), ", ".join(f"`{_short(i)}`" for i in ids)])
+    save_picture(mosaic([shown_id(ids) for ids in families().values()]), docs / "images" / "environments.png")
     table = markdown_table(("family", "what it is", "ids"), index, ())
     intro = "Written by `beliefgym envs --pages`; every number on these pages is measured by a command named there."
     (pages / "README.md").write_text("\n".join(["# Environments", "", intro, "", *table]) + "\n")
@@ -61,15 +63,19 @@ def families() -> dict[str, list[str]]:
     found: dict[str, list[str]] = defaultdict(list)
     for env_id in registered_ids():
         env = gym.make(env_id).unwrapped
-        found[type(getattr(env, "system", env)).__name__].append(env_id)
-    return {name: sorted(ids, key=_hidden) for name, ids in sorted(found.items())}
+        found[type(getattr(env, "system", env)).__name__.removesuffix("Env")].append(env_id)
+    return {name: _ordered(ids) for name, ids in sorted(found.items())}
 
 
-def _hidden(env_id: str) -> tuple[int, int, str]:
-    """Sorts the id that hides nothing and disturbs nothing to the front."""
-    env = gym.make(env_id)
-    layers = len(gym.spec(env_id).kwargs.get("layers", ()))
-    return -len(component_names(env)), layers, env_id
+def _ordered(ids: list[str]) -> list[str]:
+    """The id without a suffix in front, then those that show more, the undisturbed before the noisy."""
+    full = min(ids, key=len)
+
+    def place(env_id: str) -> tuple[bool, int, int, str]:
+        layers = len(gym.spec(env_id).kwargs.get("layers", ()))
+        return env_id != full, -len(component_names(gym.make(env_id))), layers, env_id
+
+    return sorted(ids, key=place)
 
 
 def shown_id(ids: list[str]) -> str:
@@ -105,6 +111,24 @@ def strip(env_id: str, moments: tuple[float, ...] = (0.0, 0.25, 1.0)) -> NDArray
         frames.append(env.render())
     env.close()
     joined: NDArray[np.uint8] = np.concatenate(frames, axis=1)
+    return joined
+
+
+def mosaic(env_ids: list[str], columns: int = 6) -> NDArray[np.uint8]:
+    """The scenes of many environments in rows, without their panels: (height, width, 3)."""
+    scenes = []
+    for env_id in env_ids:
+        env = gym.make(env_id, render_mode="rgb_array")
+        env.reset(seed=3)
+        for _ in range(3):
+            env.step(env.action_space.sample() * 0)
+        picture: Any = env.render()
+        env.close()
+        scenes.append(picture[:, : picture.shape[0]])
+    empty = np.full_like(scenes[0], 250)
+    scenes += [empty] * (-len(scenes) % columns)
+    rows = [np.concatenate(scenes[i : i + columns], axis=1) for i in range(0, len(scenes), columns)]
+    joined: NDArray[np.uint8] = np.concatenate(rows, axis=0)
     return joined
 
 
@@ -155,9 +179,14 @@ def page(name: str, ids: list[str], without_memory: Scores) -> str:
 def difficulty(ids: list[str], without_memory: Scores) -> str:
     """In words: what hiding costs an agent without memory."""
     scores = {env_id: float(np.mean(without_memory[env_id])) for env_id in ids if env_id in without_memory}
-    if len(scores) < 2 or ids[0] not in scores:
+    steps = f"{TIERS['difficulty']['steps']['ppo']:,}"
+    if ids[0] not in scores:
         return ""
-    said = [f"With everything shown, PPO without memory scores {scores[ids[0]]:.2f} (random 0, expert 1)."]
+    if len(ids) == 1:
+        return f"After {steps} steps PPO without memory scores {scores[ids[0]]:.2f} (random 0, expert 1)."
+    said = [
+        f"With everything shown, PPO without memory scores {scores[ids[0]]:.2f} after {steps} steps (random 0, expert 1)."
+    ]
     for env_id in ids[1:]:
         if env_id in scores:
             said.append(

@@ -13,6 +13,8 @@ def test_every_id_is_in_one_family_and_the_full_one_leads():
     assert sorted(env_id for ids in families.values() for env_id in ids) == registered_ids()
     assert families["CartPole"] == ["beliefgym/CartPoleSwingUp-v0", "beliefgym/CartPoleSwingUpPosition-v0"]
     assert families["CartPoleBalance"][0] == "beliefgym/CartPoleBalance-v0"
+    assert families["MobileBase"][0] == "beliefgym/MobileBase-v0"  # although the landmarks are more numbers
+    assert families["Hopper"] == ["beliefgym/HopperPosition-v0"]
 
 
 def test_a_page_holds_picture_table_and_data_sheet(tmp_path, monkeypatch):
@@ -32,7 +34,7 @@ def test_a_page_holds_picture_table_and_data_sheet(tmp_path, monkeypatch):
     pages.write_pages(tmp_path / "docs", results, told=lambda name: None)
     page = (tmp_path / "docs" / "environments" / "Pendulum.md").read_text()
     assert "0.95 (0.90 to 1.00)" in page
-    assert "With everything shown, PPO without memory scores 0.95" in page
+    assert "With everything shown, PPO without memory scores 0.95 after 200,000 steps" in page
     assert "On `PendulumPosition-v0` the same agent with the same budget scores 0.25." in page
     assert "| 0 | theta " in page  # the data sheet
     picture = Image.open(tmp_path / "docs" / "images" / "environments" / "Pendulum.png")
