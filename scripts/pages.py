@@ -185,7 +185,8 @@ def difficulty(ids: list[str], without_memory: Scores) -> str:
     if len(ids) == 1:
         return f"After {steps} steps PPO without memory scores {scores[ids[0]]:.2f} (random 0, expert 1)."
     said = [
-        f"With everything shown, PPO without memory scores {scores[ids[0]]:.2f} after {steps} steps (random 0, expert 1)."
+        f"With everything shown, PPO without memory scores {scores[ids[0]]:.2f} after {steps} steps "
+        "(random 0, expert 1)."
     ]
     for env_id in ids[1:]:
         if env_id in scores:

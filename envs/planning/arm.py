@@ -34,6 +34,7 @@ import control
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.planning.linearisation import expand_cost
 from beliefgym.envs.rigid_body import RigidArm
 
@@ -119,20 +120,12 @@ class ReachController:
         Raises:
             ValueError: a wrong shape, or a state that is not finite.
         """
-        state = np.asarray(state, dtype=np.float64)
-        if state.ndim != 2 or state.shape[1] != self.system.n_state:
-            raise ValueError(f"expected state as (n, {self.system.n_state}), got shape {state.shape}")
-        if not np.isfinite(state).all():
-            raise ValueError(f"the state of copy {int(np.argwhere(~np.isfinite(state))[0][0])} is not finite")
+        state, begun = checked_batch(self.system, state, restart)
         n, dof = len(state), self.system.arm.dof
         if n != len(self._known):
             self.targets, self._held = np.zeros((n, dof)), np.zeros((n, dof))
             self._known = np.zeros(n, dtype=bool)
-        if restart is not None:
-            restart = np.asarray(restart, dtype=bool)
-            if restart.shape != (n,):
-                raise ValueError(f"expected restart as ({n},), got shape {restart.shape}")
-            self._known &= ~restart
+        self._known &= ~begun
         new = np.flatnonzero(~self._known)
         if len(new):
             self.targets[new] = self._configuration(state[new])

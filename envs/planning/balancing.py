@@ -12,6 +12,7 @@ import control
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.planning.linearisation import expand_cost, linearise
 from beliefgym.envs.system import System
 
@@ -33,7 +34,8 @@ class BalancingController:
 
     def act(self, state: ArrayLike, restart: NDArray[np.bool_] | None = None) -> Floats:
         """Actions (rows, m) for states (rows, n); it keeps no memory of an episode."""
-        deviation = np.asarray(state, dtype=np.float64) - self.state
+        states, _ = checked_batch(self.system, state, restart)
+        deviation = states - self.state
         actions: Floats = self.system.clip(self.action - deviation @ self.gain.T)
         return actions
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.cart_pole import CartPole
 from beliefgym.envs.planning.action_tree import tree_search
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.planning.ilqr import ILQR
 from beliefgym.envs.planning.linearisation import expand_cost, linearise
 from beliefgym.envs.system import Array, wrap_angle
@@ -121,18 +122,10 @@ class CartPoleController:
         Raises:
             ValueError: a wrong shape, or a state that is not finite.
         """
-        state = np.asarray(state, dtype=np.float64)
-        if state.ndim != 2 or state.shape[1] != self.system.n_state:
-            raise ValueError(f"expected state as (n, {self.system.n_state}), got shape {state.shape}")
-        if not np.isfinite(state).all():
-            raise ValueError(f"the state of copy {int(np.argwhere(~np.isfinite(state))[0][0])} is not finite")
+        state, begun = checked_batch(self.system, state, restart)
         if len(state) != len(self.clock):
             self._forget(len(state))
-        if restart is not None:
-            restart = np.asarray(restart, dtype=bool)
-            if restart.shape != (len(state),):
-                raise ValueError(f"expected restart as ({len(state)},), got shape {restart.shape}")
-            self.planned &= ~restart
+        self.planned &= ~begun
         action, gain, deviation = self._on_plan(state)
         again = np.flatnonzero(~self.planned | (self.upright_cost(deviation) > REPLAN_COST))
         if len(again):

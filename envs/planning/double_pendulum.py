@@ -33,6 +33,7 @@ from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.double_pendulum import DoublePendulum
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.planning.ilqr import ILQR, ILQRSolution
 from beliefgym.envs.planning.linearisation import expand_cost, linearise
 from beliefgym.envs.system import Array, wrap_angle
@@ -254,18 +255,10 @@ class DoublePendulumController:
         Raises:
             ValueError: a wrong shape, or a state that is not finite.
         """
-        state = np.asarray(state, dtype=np.float64)
-        if state.ndim != 2 or state.shape[1] != self.system.n_state:
-            raise ValueError(f"expected state as (n, {self.system.n_state}), got shape {state.shape}")
-        if not np.isfinite(state).all():
-            raise ValueError(f"the state of copy {int(np.argwhere(~np.isfinite(state))[0][0])} is not finite")
+        state, begun = checked_batch(self.system, state, restart)
         if len(state) != len(self.clock):
             self._forget(len(state))
-        if restart is not None:
-            restart = np.asarray(restart, dtype=bool)
-            if restart.shape != (len(state),):
-                raise ValueError(f"expected restart as ({len(state)},), got shape {restart.shape}")
-            self.planned &= ~restart
+        self.planned &= ~begun
         at = np.arange(len(state)), self.clock
         deviation = wrapped(state - self.states[at])
         loss = 0.5 * np.einsum("ij,ijk,ik->i", deviation, self.values[at], deviation)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.planning.linearisation import linearise
 from beliefgym.envs.quaternions import conjugate, product
 from beliefgym.envs.system import System
@@ -169,7 +170,7 @@ class ErrorFeedback:
         Returns:
             (n, n_action), within the limits.
         """
-        states = np.asarray(state, dtype=float)
+        states, _ = checked_batch(self.system, state, restart)
         if self.clock is None:
             error = error_state(self.system, states, self.targets[0])
             action = self.actions[0] - error @ self.gains[0].T

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.mico import MicoLift
 from beliefgym.envs.mico_arm import LINKS, TIP
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.rigid_body import RigidArm
 
 Floats = NDArray[np.float64]
@@ -51,11 +52,7 @@ class PayloadFeedforward:
         Raises:
             ValueError: a wrong shape, or a state that is not finite.
         """
-        state = np.asarray(state, dtype=np.float64)
-        if state.ndim != 2 or state.shape[1] != self.system.n_state:
-            raise ValueError(f"expected state as (n, {self.system.n_state}), got shape {state.shape}")
-        if not np.isfinite(state).all():
-            raise ValueError(f"the state of copy {int(np.argwhere(~np.isfinite(state))[0][0])} is not finite")
+        state, _ = checked_batch(self.system, state, restart)
         time, start = state[:, 19], state[:, 20:]
         known = state[:, 18] if self.assumed_mass is None else np.full(len(state), self.assumed_mass)
         mass = np.where(self.system.carries(time), known, 0.0)

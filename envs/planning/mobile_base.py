@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.mobile_base import MobileBaseKinematic
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.system import wrap_angle
 
 Floats = NDArray[np.float64]
@@ -41,16 +42,14 @@ class MobileBaseController:
 
     def act(self, state: ArrayLike, restart: NDArray[np.bool_] | None = None) -> Floats:
         """Actions (n, 2) for states (n, n_state); `restart` marks copies whose episode has just begun."""
-        x, y, theta = np.asarray(state, dtype=np.float64)[:, :3].T
+        states, begun = checked_batch(self.system, state, restart)
+        x, y, theta = states[:, :3].T
         rho = np.hypot(x, y)
         to_goal = np.arctan2(-y, -x)
-        if len(self._backwards) != len(x):
-            self._backwards, restart = np.zeros(len(x), dtype=np.bool_), None
-            fresh = np.ones(len(x), dtype=np.bool_)
-        else:
-            fresh = np.zeros(len(x), dtype=np.bool_) if restart is None else restart
+        if len(self._backwards) != len(x):  # another batch: all begin
+            self._backwards, begun = np.zeros(len(x), dtype=np.bool_), np.ones(len(x), dtype=np.bool_)
         behind = np.abs(wrap_angle(to_goal - theta)) > 0.5 * np.pi
-        self._backwards = np.where(fresh, behind, self._backwards)
+        self._backwards = np.where(begun, behind, self._backwards)
         turned = np.where(self._backwards, np.pi, 0.0)
         alpha = wrap_angle(to_goal - theta - turned)
         phi = wrap_angle(to_goal - turned)

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefgym.envs.planning.controller_input import checked_batch
 from beliefgym.envs.planning.linearisation import expand_cost
 from beliefgym.envs.planning.lqr import error_basis, error_dynamics, error_state, steady_state_gain
 from beliefgym.envs.quadrotor import Quadrotor
@@ -68,7 +69,8 @@ class QuadrotorController:
         Returns:
             (n, 4), within the limits.
         """
-        ahead = without_heading(np.asarray(state, dtype=float))
+        states, _ = checked_batch(self.system, state, restart)
+        ahead = without_heading(states)
         target, action = steady_hover(self.system, ahead[:, 20:22])
         error = error_state(self.system, ahead, target)[:, list(REGULATED)]
         feedback = error @ self.gain.T
