@@ -60,7 +60,10 @@ class Helicopter(System):
     start_speed and start_turn add a velocity and a turn of a random direction, each uniform up to that size.
     End (terminated): distance from the origin above max_distance, speed above max_speed, a body rate above max_rate,
     or the rotor's axis more than max_tilt from the vertical; or after 400 steps.
-    Versions: v0, the first. `beliefgym/HelicopterHoverPosition-v0` shows position and q only.
+    Versions: v0, the first. `beliefgym/HelicopterHoverPosition-v0` shows position and q only. In
+    `beliefgym/HelicopterHoverNoisy-v0` every component has noise of 0.1 in its unit (the source's observation noise;
+    `noise=` sets another), `beliefgym/HelicopterHoverDelayed-v0` shows what was one step ago (`delay=` sets another k;
+    Ross and Bagnell used 0 and 1, and the LQR of the source's cost diverges from k = 4 on).
 
     Chosen here, since the source says nothing of them: the reward's shape, max_change (the source has no limits; the
     expert at noise 1 from 10 m away stays within this one), the limits that end an episode, the start's ball, 400

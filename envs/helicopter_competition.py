@@ -66,6 +66,8 @@ class HelicopterCompetition(System):
     competition). End: a component of the position (NED) beyond max_position, of the velocity (NED) beyond max_velocity,
     a body rate beyond max_rate, or |q_w| below min_q_w (a turn of 30 degrees in all); or after 6000 steps.
     Versions: v0, the first. `beliefgym/HelicopterCompetitionPosition-v0` shows position and q only.
+    On this scale every agent that stays in the air scores about 1, since the random policy returns -1e7: compare
+    returns, not scores.
 
     Chosen here: the competition's own gusts (gust_multiplier 2) and velocity limit (5 m/s); rlpy has 1 and 10. The step
     of the crash counts as one of those left. expert_effort, the expert's price on sticks, which the reward lacks.
