@@ -79,8 +79,13 @@ def _ordered(ids: list[str]) -> list[str]:
 
 
 def shown_id(ids: list[str]) -> str:
-    """The id whose picture stands for a family: the first partially observed one."""
-    return ids[min(1, len(ids) - 1)]
+    """The id whose picture stands for a family: of those without noise the one that shows least."""
+
+    def place(env_id: str) -> tuple[bool, int]:
+        layers = [name for name, _ in gym.spec(env_id).kwargs.get("layers", ())]
+        return "ObservationNoise" in layers, len(component_names(gym.make(env_id)))
+
+    return min(ids, key=place)
 
 
 def strip(env_id: str, moments: tuple[float, ...] = (0.0, 0.25, 1.0)) -> NDArray[np.uint8]:

@@ -14,6 +14,7 @@ def test_every_id_is_in_one_family_and_the_full_one_leads():
     assert families["CartPole"] == ["beliefgym/CartPoleSwingUp-v0", "beliefgym/CartPoleSwingUpPosition-v0"]
     assert families["CartPoleBalance"][0] == "beliefgym/CartPoleBalance-v0"
     assert families["MobileBase"][0] == "beliefgym/MobileBase-v0"  # although the landmarks are more numbers
+    assert pages.shown_id(families["Helicopter"]) == "beliefgym/HelicopterHoverPosition-v0"
     assert families["Hopper"] == ["beliefgym/HopperPosition-v0"]
 
 
