@@ -20,7 +20,7 @@ in_checkout = pytest.mark.skipif(
 
 
 @in_checkout
-def test_a_wheel_holds_every_module_of_the_tree(tmp_path):
+def test_a_wheel_holds_every_module_and_data_file_of_the_tree(tmp_path):
     copy = tmp_path / "copy"  # so that what an earlier build left in the tree does not count
     copy.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE", "src", *FOLDERS):
@@ -50,7 +50,7 @@ def test_a_wheel_holds_every_module_of_the_tree(tmp_path):
         f"beliefgym/{path.relative_to(ROOT)}"
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("*")
-        if path.suffix in (".py", ".json") and "__pycache__" not in path.parts
+        if path.suffix in (".py", ".json", ".safetensors") and "__pycache__" not in path.parts
     }
     tree |= {f"beliefgym/{name}" for name in ("__init__.py", "__main__.py", "_version.py", "py.typed")}
     assert packed == tree
