@@ -132,10 +132,7 @@ def _mobile_base() -> None:
         max_episode_steps=200,
         partial={"": motion, "Position": ("x", "y"), "Landmarks": landmarks},
         noisy={
-            "Noisy": (
-                motion,
-                [0.006, 0.006, 0.051, 0.051, 0.0, 0.0],
-            ),  # m, and rad as seen in cosine and sine
+            "Noisy": (motion, [0.006] * 2 + [0.051] * 2 + [0.0] * 2),  # m; rad as cosine and sine show it
             "LandmarksNoisy": (landmarks, 0.05),
         },
     )
