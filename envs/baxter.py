@@ -110,15 +110,9 @@ class BaxterReach(BaxterArm):
 
     def stage_cost(self, state: Array, action: Array) -> Array:
         """Quadratic in the distance from the target at rest, and in the torque beyond the one that holds it."""
-        xp = array_namespace(state)
         error = state[..., :7] - constant(np.array(self.target), state)
-        velocity = state[..., 7:14]
         held = self.arm.gravity_torque(np.array(self.target))
-        effort = (action - constant(held, action)) / constant(self.arm.efforts, action)
-        quadratic = xp.sum(error * error, axis=-1)
-        return (
-            quadratic + 0.01 * xp.sum(velocity * velocity, axis=-1) + 0.01 * xp.sum(effort * effort, axis=-1)
-        )
+        return self.reaching_cost(error, state[..., 7:14], action - constant(held, action))
 
     def initial_state(
         self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None

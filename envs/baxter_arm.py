@@ -255,6 +255,15 @@ class BaxterArm(MujocoSystem):
         gentle = 1.0 - xp.mean(effort * effort, axis=-1)
         return self.nearness(next_state) * (0.8 + 0.1 * slow + 0.1 * gentle)
 
+    def reaching_cost(self, miss: Array, velocity: Array, torque: Array) -> Array:
+        """|miss|^2 + 0.01 |velocity|^2 + 0.01 |torque / effort|^2: (..., k), (..., 7), (..., 7) -> (...)."""
+        xp = array_namespace(miss)
+        effort = torque / constant(self.arm.efforts, torque)
+        quadratic = xp.sum(miss * miss, axis=-1)
+        return (
+            quadratic + 0.01 * xp.sum(velocity * velocity, axis=-1) + 0.01 * xp.sum(effort * effort, axis=-1)
+        )
+
     def draw_angles(self, streams: RandomStreams, mask: NDArray[np.bool_] | None, part: float) -> Floats:
         """Joint angles uniform in the middle part of each joint's range, (n, 7) rad."""
         low, high = self.arm.limits

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefgym.envs.baxter import BaxterReach
 from beliefgym.envs.baxter_arm import BaxterArm, Floats
-from beliefgym.envs.system import Array, constant
+from beliefgym.envs.system import Array
 
 if TYPE_CHECKING:
     from beliefgym.envs.random_streams import RandomStreams
@@ -89,13 +89,8 @@ class BaxterReachHand(BaxterArm):
 
     def stage_cost(self, state: Array, action: Array) -> Array:
         """100 D^2 + 0.01 |v|^2 + 0.01 |torque / effort|^2."""
-        xp = array_namespace(state)
         miss = (self.arm.tip_position(state[..., :7]) - state[..., 14:17]) * 10.0
-        velocity, effort = state[..., 7:14], action / constant(self.arm.efforts, action)
-        quadratic = xp.sum(miss * miss, axis=-1)
-        return (
-            quadratic + 0.01 * xp.sum(velocity * velocity, axis=-1) + 0.01 * xp.sum(effort * effort, axis=-1)
-        )
+        return self.reaching_cost(miss, state[..., 7:14], action)
 
     def initial_state(
         self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None
