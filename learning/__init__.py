@@ -8,8 +8,11 @@ from beliefgym.learning.polynomial import PolynomialRidge
 from beliefgym.learning.random_forest import RandomForest
 from beliefgym.learning.random_fourier import RandomFourierRidge
 from beliefgym.learning.sequences import Sequences
+from beliefgym.learning.sequences_csv import from_csv, to_csv
 from beliefgym.learning.sequences_minari import from_minari, to_minari
 from beliefgym.learning.sequences_npz import load_npz, save_npz
+from beliefgym.learning.video_frames import read_frames, split_video
+from beliefgym.learning.video_textures import VideoTexture
 from beliefgym.learning.windows import Transitions, Windows
 
 __all__ = [
@@ -23,10 +26,15 @@ __all__ = [
     "Ridge",
     "Sequences",
     "Transitions",
+    "VideoTexture",
     "Windows",
+    "from_csv",
     "from_minari",
     "load_npz",
     "multi_step_errors",
+    "read_frames",
     "save_npz",
+    "split_video",
+    "to_csv",
     "to_minari",
 ]

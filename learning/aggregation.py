@@ -1,8 +1,8 @@
 """Learning on a growing data set: what every dataset-aggregation algorithm asks of a learner.
 
 Three learners stand behind the same calls. `SufficientStatistics` (follow the leader, for regressors that can
-`accumulate`) keeps sums and no data. `StoredAggregate` (follow the leader, for every other regressor) keeps the data and
-fits a clone to all of it. `GradientSteps` (online gradient descent, for regressors linear in features) takes one
+`accumulate`) keeps sums and no data. `StoredAggregate` (follow the leader, for every other regressor) keeps the data
+and fits a clone to all of it. `GradientSteps` (online gradient descent, for regressors linear in features) takes one
 gradient step for each batch, and keeps neither.
 
 Inputs are encoded once: the features that a rollout needs for its prediction are those that the correction at that

@@ -184,7 +184,7 @@ class DataAsDemonstrator(DynamicsModel):
         z, u = self._coordinates(rollouts)
         if learner is None:
             predicted, cut = self._forecast(z[:, 0], u)
-            diverged = np.count_nonzero(cut < rollouts.lengths)
+            diverged = int(np.count_nonzero(cut < rollouts.lengths))
             return predicted, {"n_added": 0, "n_outlying": 0, "n_diverged": diverged}
         predicted = np.empty_like(z)
         predicted[:, 0] = z[:, 0]
@@ -205,11 +205,11 @@ class DataAsDemonstrator(DynamicsModel):
                     learner.add(code, target)
                 else:
                     learner.add(code[kept], target[kept])
-                counts["n_added"] += np.count_nonzero(kept)
-                counts["n_outlying"] += np.count_nonzero(~kept)
+                counts["n_added"] += int(np.count_nonzero(kept))
+                counts["n_outlying"] += int(np.count_nonzero(~kept))
             inside = self._inside(z_next)
             if not inside.all():
-                counts["n_diverged"] += np.count_nonzero(~inside)
+                counts["n_diverged"] += int(np.count_nonzero(~inside))
                 going, z_next = going[inside], z_next[inside]
             predicted[going, t + 1] = z_next
         return predicted, counts

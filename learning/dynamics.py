@@ -184,7 +184,8 @@ class DynamicsModel(BaseEstimator):
     def _inside(self, z: Array) -> NDArray[np.bool_]:
         """(n,) which states are finite and within the divergence limit."""
         with np.errstate(invalid="ignore", over="ignore"):
-            return (np.abs(z - self._centre) <= self.divergence_limit * self._spread).all(axis=-1)
+            inside: NDArray[np.bool_] = np.abs(z - self._centre) <= self.divergence_limit * self._spread
+        return np.asarray(inside.all(axis=-1))
 
     def _forecast(self, z: Array, u: Array) -> tuple[Array, NDArray[np.int64]]:
         """Predict from z (n, n_obs) with actions (n, n_steps, n_act).

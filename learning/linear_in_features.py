@@ -55,9 +55,9 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
             ValueError: shapes, NaN, infinities, a negative alpha or weight.
         """
         self._check_parameters()
-        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, order="C")
-        self._start(X.shape[1], 1 if y.ndim == 1 else y.shape[1], y.ndim)
-        self._add_checked(X, y, sample_weight)
+        inputs, targets = self._checked(X, y, reset=True)
+        self._start(inputs.shape[1], 1 if targets.ndim == 1 else targets.shape[1], targets.ndim)
+        self._add_checked(inputs, targets, sample_weight)
         return self
 
     def accumulate(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> Self:
@@ -67,20 +67,18 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if not hasattr(self, "equations_"):
             return self.fit(X, y, sample_weight)
-        X, y = validate_data(
-            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, order="C", reset=False
-        )
-        n_targets = 1 if y.ndim == 1 else y.shape[1]
+        inputs, targets = self._checked(X, y, reset=False)
+        n_targets = 1 if targets.ndim == 1 else targets.shape[1]
         if n_targets != self._weights.shape[1]:
             raise ValueError(f"expected y with {self._weights.shape[1]} targets as before, got {n_targets}")
-        self._add_checked(X, y, sample_weight)
+        self._add_checked(inputs, targets, sample_weight)
         return self
 
     def predict(self, X: ArrayLike) -> Array:
         """(n, n_inputs) -> (n, d), or (n,) where y was 1-D."""
         check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, order="C", reset=False)
-        predicted = self.predict_unchecked(X)
+        inputs: Any = validate_data(self, X, dtype=np.float64, order="C", reset=False)
+        predicted = self.predict_unchecked(inputs)
         return predicted[:, 0] if self._y_ndim == 1 else predicted
 
     def predict_unchecked(self, X: Array) -> Array:
@@ -132,6 +130,11 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
             n_features, n_targets, intercept=self.fit_intercept, shifted=not self._bounded_features
         )
         self._set(np.zeros((n_features, n_targets)), np.zeros(n_targets))
+
+    def _checked(self, X: ArrayLike, y: ArrayLike, reset: bool) -> tuple[Any, Any]:
+        return validate_data(
+            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, order="C", reset=reset
+        )
 
     def _add_checked(self, X: Array, y: Array, sample_weight: ArrayLike | None) -> None:
         weights = None

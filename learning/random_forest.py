@@ -12,7 +12,7 @@ Reference: thesis proposal, Sec. 3.1.3; Breiman, "Random forests", 2001.
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -79,11 +79,13 @@ class RandomForest(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Args:
             X: (n, n_inputs). y: (n, d) or (n,).
         """
-        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
-        self._y_ndim = y.ndim
+        inputs: Any
+        targets: Any
+        inputs, targets = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        self._y_ndim = targets.ndim
         samples = self.max_samples
         if isinstance(samples, int | np.integer) and not isinstance(samples, bool):
-            samples = min(int(samples), len(X))  # a number above n would be refused
+            samples = min(int(samples), len(inputs))  # a number above n would be refused
         forest = RandomForestRegressor(
             self.n_estimators,
             max_depth=self.max_depth,
@@ -93,16 +95,17 @@ class RandomForest(MultiOutputMixin, RegressorMixin, BaseEstimator):
             random_state=self.random_state,
             n_jobs=self.n_jobs,
         )
-        forest.fit(X, y[:, 0] if y.ndim == 2 and y.shape[1] == 1 else y)
+        n_targets = 1 if targets.ndim == 1 else targets.shape[1]
+        forest.fit(inputs, targets.reshape(-1) if n_targets == 1 else targets)
         self.min_samples_leaf_ = self.min_samples_leaf
-        self._flatten(forest, 1 if y.ndim == 1 else y.shape[1])
+        self._flatten(forest, n_targets)
         return self
 
     def predict(self, X: ArrayLike) -> Array:
         """(n, n_inputs) -> (n, d), or (n,) where y was 1-D: the mean over the trees."""
         check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, reset=False)
-        predicted = self.predict_unchecked(X)
+        inputs: Any = validate_data(self, X, dtype=np.float64, reset=False)
+        predicted = self.predict_unchecked(inputs)
         return predicted[:, 0] if self._y_ndim == 1 else predicted
 
     def predict_unchecked(self, X: Array) -> Array:
