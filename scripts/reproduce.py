@@ -12,11 +12,16 @@ from rich.console import Console
 from rich.table import Table
 
 from beliefgym.scripts.named_record import check_name, markdown_table, write_record
+from beliefgym.scripts.reproductions.report import Report, Request
 
 REPRODUCTIONS = {
     "env-experts": "beliefgym.scripts.reproductions.env_experts:run",
+    "dad-table": "beliefgym.scripts.reproductions.dad_table:run",
+    "dad-map": "beliefgym.scripts.reproductions.dad_map:run",
+    "dad-growth": "beliefgym.scripts.reproductions.dad_growth:run",
+    "dad-rivals": "beliefgym.scripts.reproductions.dad_rivals:run",
+    "dad-video": "beliefgym.scripts.reproductions.dad_video:run",
 }
-HEADER = ("what", "ours", "reference", "target", "meets")
 
 
 @dataclass(frozen=True)
@@ -26,43 +31,95 @@ class Reproduce:
     For example:
 
         beliefgym reproduce env-experts
+        beliefgym reproduce dad-table --data path/to/recordings --jobs 2
+        beliefgym reproduce dad-video --video my_clip.mp4
     """
 
     name: tyro.conf.Positional[str]
     """Which; a wrong name lists them."""
     seed: int = 0
     """First seed."""
+    seeds: int = 5
+    """Number of seeds, for those that average over them."""
+    jobs: int = 1
+    """Processes."""
+    data: Path | None = None
+    """Folder of recorded data; what needs it is left out without, and said."""
+    video: Path | None = None
+    """A video of your own, for dad-video."""
     results: Path = Path("results")
-    """Folder; NAME.json and NAME.md are written to its reproduction/."""
+    """Folder; NAME.json, NAME.md and figures are written to its reproduction/."""
 
     def run(self) -> int:
         """Compute, write, print; 0 even where a target is missed: the table says so."""
         check_name("reproduction", self.name, REPRODUCTIONS)
+        self._check()
         module, _, function = REPRODUCTIONS[self.name].partition(":")
         console = Console()
+        folder = self.results / "reproduction"
+        folder.mkdir(parents=True, exist_ok=True)
         with console.status("computing") as status:
-            about, rows = getattr(import_module(module), function)(
-                self.seed, lambda text: status.update(f"computing {text}")
-            )
-        command = f"beliefgym reproduce {self.name} --seed {self.seed}"
-        record = {"command": command, "about": about, "seed": self.seed, "rows": rows}
-        path = self.results / "reproduction" / f"{self.name}.json"
-        write_record(path, record, _page(self.name, about, command, rows))
+
+            def told(text: str) -> None:
+                status.update(f"computing {text}")
+                if not console.is_terminal:
+                    console.print(text)
+
+            request = Request(self.seed, self.seeds, self.jobs, folder, self.data, self.video, told)
+            report: Report = getattr(import_module(module), function)(request)
+        path = folder / f"{self.name}.json"
+        record = {
+            "command": self._command(),
+            "about": report.about,
+            "seed": self.seed,
+            "configuration": report.configuration,
+            "rows": report.rows,
+            "figures": report.figures,
+            "notes": report.notes,
+        }
+        write_record(path, record, _page(self.name, report, self._command()))
         table = Table()
-        for name in HEADER:
+        for name in report.columns:
             table.add_column(name, justify="left" if name == "what" else "right")
-        for row in rows:
-            table.add_row(*_cells(row))
+        for row in report.rows:
+            table.add_row(*_cells(row, report.columns))
         console.print(table)
+        for note in report.notes:
+            console.print(note)
         console.print(f"written: {path}, {path.with_suffix('.md')}")
         return 0
 
+    def _check(self) -> None:
+        for name, least in (("seeds", 1), ("jobs", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"expected --{name} of at least {least}, got {getattr(self, name)}")
+        for name in ("data", "video"):
+            path = getattr(self, name)
+            if path is not None and not path.exists():
+                raise FileNotFoundError(f"--{name}: there is no {path}")
 
-def _page(name: str, about: str, command: str, rows: list[dict[str, Any]]) -> str:
-    table = markdown_table(HEADER, [_cells(row) for row in rows], ("ours", "reference", "target"))
-    return "\n".join([f"# {name}", "", about, "", f"`{command}`", "", *table]) + "\n"
+    def _command(self) -> str:
+        given = f" --seed {self.seed}"
+        if self.seeds != 5:
+            given += f" --seeds {self.seeds}"
+        if self.data is not None:
+            given += " --data DATA"
+        if self.video is not None:
+            given += f" --video {self.video.name}"
+        return f"beliefgym reproduce {self.name}{given}"
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
+def _page(name: str, report: Report, command: str) -> str:
+    numbers = tuple(column for column in report.columns if column not in ("what", "meets"))
+    table = markdown_table(report.columns, [_cells(row, report.columns) for row in report.rows], numbers)
+    lines = [f"# {name}", "", report.about, "", f"`{command}`", "", *table]
+    for note in report.notes:
+        lines += ["", note]
+    for file, caption in report.figures.items():
+        lines += ["", f"![{caption}]({file})", "", caption]
+    return "\n".join(lines) + "\n"
+
+
+def _cells(row: dict[str, Any], columns: tuple[str, ...]) -> list[str]:
     meets = {None: "", True: "yes", False: "no"}[row.get("meets")]
-    return [row["what"], *(str(row.get(name) or "") for name in ("ours", "reference", "target")), meets]
+    return [meets if name == "meets" else str(row.get(name) or "") for name in columns]

@@ -6,7 +6,6 @@ its noise included; success is judged on the true states of the last second of t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from beliefgym.agents import make_agent
 from beliefgym.envs import System
+from beliefgym.scripts.reproductions.report import Report, Request, Row
 from beliefgym.scripts.reproductions.successes import TRIALS, Trial
 from beliefgym.wrappers.task import Task
 
@@ -38,17 +38,12 @@ class Outcome:
     measure: NDArray[np.float64]
 
 
-def run(seed: int, told: Callable[[str], None]) -> tuple[str, list[dict[str, Any]]]:
-    """The rows of all experts that have a criterion.
-
-    Args:
-        seed: added to the first seed of the starts.
-        told: hears of each environment.
-    """
-    rows = []
+def run(request: Request) -> Report:
+    """The rows of all experts that have a criterion; the request's seed is added to the first seed of the starts."""
+    rows: list[Row] = []
     for trial in TRIALS:
-        told(trial.label)
-        found = outcome(trial, N_STARTS, FIRST_SEED + seed)
+        request.told(trial.label)
+        found = outcome(trial, N_STARTS, FIRST_SEED + request.seed)
         rate = float(found.succeeded.mean())
         rows.append(
             {
@@ -64,7 +59,7 @@ def run(seed: int, told: Callable[[str], None]) -> tuple[str, list[dict[str, Any
         f"Experts on their true models, {N_STARTS} starts each, noise as registered. The third column is the measure "
         "that success is judged by."
     )
-    return about, rows
+    return Report(about, ("what", "ours", "reference", "target", "meets"), rows)
 
 
 def outcome(trial: Trial, n: int, seed: int) -> Outcome:
