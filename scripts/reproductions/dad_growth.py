@@ -61,7 +61,8 @@ def run(request: Request) -> Report:
 
 ABOUT = (
     "Growth of the prediction error with the horizon: free pendulum, 300 trajectories of 50 steps of 0.05 s, ridge "
-    "regression on cubic monomials (linear in features with a regularised squared loss, as Theorem 3.1.3 asks for); DaD with training rollouts of 10 steps, the best of 40 iterations on validation trajectories."
+    "regression on cubic monomials (linear in features with a regularised squared loss, as Theorem 3.1.3 asks for); "
+    "DaD with training rollouts of 10 steps, the best of 40 iterations on validation trajectories."
 )
 NOTES = [
     "Errors are medians over the test trajectories, so that the few rollouts of the single-step model that blow up do "

@@ -47,9 +47,7 @@ COLUMNS = ("what", "single step", "DaD", "improvement", "thesis", "meets")
 def run(request: Request) -> Report:
     """All rows of Table 3.1 for which there are data."""
     cells: dict[str, dict[str, Any]] = {}
-    absent = [
-        name for name in RECORDED if request.data is None or not (request.data / data.CLIPS[name]).exists()
-    ]
+    absent = [name for name in RECORDED if not present(name, request.data)]
     for (system, learner), seed in product(THESIS, range(request.seed, request.seed + request.seeds)):
         if system not in absent:
             cell = {
@@ -123,6 +121,11 @@ def row(system: str, learner: str, results: list[dict[str, Any]]) -> Row:
         "values": {"single": single.to_dict(), "dad": dad.to_dict(), "improvement": improvement.to_dict()},
         "failed_seeds": len(results) - len(good),
     }
+
+
+def present(clip: str, folder: Path | None) -> bool:
+    """Whether the folder of recorded data holds this clip."""
+    return folder is not None and (folder / data.CLIPS[clip]).exists()
 
 
 def flag_video(request: Request) -> Path:
