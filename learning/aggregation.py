@@ -13,7 +13,7 @@ Reference: thesis proposal, Sec. 3.1.2: Follow-the-Leader, and online methods th
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +73,7 @@ def learner_for(regressor: Any, algorithm: Algorithm, X: Array, Y: Array, step_s
             )
         return GradientSteps(regressor, X, Y, step_size)
     if algorithm != "follow_the_leader":
-        raise ValueError(f"expected algorithm 'follow_the_leader' or 'online_gradient', got {algorithm!r}")
+        raise ValueError(f"expected algorithm to be one of {get_args(Algorithm)}, got {algorithm!r}")
     if isinstance(regressor, LinearInFeatures):
         return SufficientStatistics(regressor, X, Y)
     return StoredAggregate(regressor, X, Y)

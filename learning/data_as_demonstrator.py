@@ -57,11 +57,14 @@ class DataAsDemonstrator(DynamicsModel):
             None for `RandomFourierRidge(random_state=0)`.
         n_iterations: N; 0 gives the ordinary single-step model.
         target: "delta" to learn x_{t+1} - x_t, or "next" to learn x_{t+1}.
-        horizon: length of the training rollouts; None for whole trajectories.
-        stride: steps between the starts of rollouts along a trajectory (1 for every point); None for `horizon`, so
-            that rollouts do not overlap. Only with a horizon.
-        outlier_threshold: leave out predictions farther from the truth than this many times the training data's
-            root mean square distance from their mean. None keeps all.
+        horizon: length of the training rollouts, which start at steps 0, horizon, 2 horizon, ... of a trajectory (the
+            remark after Theorem 3.1.3; Sec. 3.2.2). None for whole trajectories, as Algorithm 1 is printed: far from
+            the truth corrections contradict each other, and long rollouts of a weak first model often improve
+            nothing. 5 to 10 is a good start; choose it on validation data.
+        stride: steps between the starts of rollouts (1 for every point); None for `horizon`, so that rollouts do not
+            overlap. Only with a horizon.
+        outlier_threshold: leave out predictions that are farther off than this many of the training data's standard
+            deviations, as root mean square over components. None keeps all.
         outlier_ratio: leave out predictions farther off than this many times the mean error of all rollouts at the
             same step. None keeps all.
         algorithm: "follow_the_leader" fits to the whole aggregate; "online_gradient" takes gradient steps.
@@ -91,7 +94,7 @@ class DataAsDemonstrator(DynamicsModel):
         *,
         n_iterations: int = 25,
         target: Target = "delta",
-        horizon: int | None = None,
+        horizon: int | None = 10,
         stride: int | None = None,
         outlier_threshold: float | None = None,
         outlier_ratio: float | None = None,
@@ -129,7 +132,7 @@ class DataAsDemonstrator(DynamicsModel):
             TypeError: not `Sequences`.
         """
         self._check_parameters()
-        self._begin(train)
+        self._begin(train, validation)
         rollouts = (
             train if self.horizon is None else train.segments(self.horizon, self.stride, keep_tail=True)
         )

@@ -44,6 +44,7 @@ class DynamicsModel(BaseEstimator):
     standardise: bool
     use_actions: bool
     divergence_limit: float
+    _fitted_attribute = "model_"  # there once a fit has given something to predict with
 
     def fit(self, train: Sequences, validation: Sequences | None = None) -> Self:
         """Learn from trajectories; see the subclass."""
@@ -115,25 +116,30 @@ class DynamicsModel(BaseEstimator):
     def single_step_error(self, sequences: Sequences) -> float:
         """Root mean square of the one-step errors |f(x_t, u_t) - x_{t+1}|, over all steps, in the data's units."""
         self._check_fitted()
+        if not sequences.n_transitions:
+            raise ValueError(f"expected at least one step to predict, got {sequences!r}")
         z, u = self._coordinates(sequences)
         episode, time = np.nonzero(sequences.step_mask)
         predicted = self._observed.invert(self._step(z[episode, time], u[episode, time]))
         error = np.square(predicted - sequences.observations[episode, time + 1]).sum(axis=1)
         return float(np.sqrt(error.mean()))
 
-    def _begin(self, train: Sequences) -> None:
-        """Check the training data and take the coordinates from them."""
-        if not isinstance(train, Sequences):
-            raise TypeError(
-                f"expected Sequences, got {type(train).__name__}; arrays go through "
-                "Sequences.from_observations(observations, actions=...)"
-            )
+    def _begin(self, train: Sequences, validation: Sequences | None = None) -> None:
+        """Check the data and take the coordinates from those to train on."""
+        for sequences in (train,) if validation is None else (train, validation):
+            if not isinstance(sequences, Sequences):
+                raise TypeError(
+                    f"expected Sequences, got {type(sequences).__name__}; arrays go through "
+                    "Sequences.from_observations(observations, actions=...)"
+                )
         if self.target not in ("delta", "next"):
             raise ValueError(f"expected target to be 'delta' or 'next', got {self.target!r}")
         if not self.divergence_limit > 0:
             raise ValueError(f"expected divergence_limit above 0, got {self.divergence_limit!r}")
         if not train.n_transitions:
             raise ValueError(f"expected at least one step to learn from, got {train!r}")
+        if validation is not None and not validation.n_transitions:
+            raise ValueError(f"expected at least one step to validate on, got {validation!r}")
         self.n_obs_, self.n_act_ = train.n_obs, train.n_act if self.use_actions else 0
         rows = train.observations[train.observation_mask]
         spread = Standardisation.of(rows)
@@ -230,11 +236,11 @@ class DynamicsModel(BaseEstimator):
         return self._acted.apply(array)
 
     def _check_fitted(self) -> None:
-        if not hasattr(self, "n_obs_"):
+        if not self.__sklearn_is_fitted__():
             raise NotFittedError(f"this {type(self).__name__} is not fitted yet; call fit(train, validation)")
 
     def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "n_obs_")
+        return hasattr(self, "n_obs_") and hasattr(self, self._fitted_attribute)
 
 
 def _rows(what: str, value: Any, n_components: int) -> Array:

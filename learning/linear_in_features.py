@@ -65,8 +65,9 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         The first call fixes the feature map and the numbers of inputs and targets. Arguments as of `fit`.
         """
-        if not hasattr(self, "equations_"):
+        if not hasattr(self, "coef_"):
             return self.fit(X, y, sample_weight)
+        self._check_not_frozen()
         inputs, targets = self._checked(X, y, reset=False)
         n_targets = 1 if targets.ndim == 1 else targets.shape[1]
         if n_targets != self._weights.shape[1]:
@@ -95,6 +96,7 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def solve(self) -> Self:
         """Bring the coefficients up to what was accumulated."""
+        self._check_not_frozen()
         self._set(*self.equations_.solve(self.alpha))
         return self
 
@@ -104,6 +106,7 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
         The copies share this one's statistics as they are now; `accumulate` on one changes it alone.
         """
         check_is_fitted(self)
+        self._check_not_frozen()
         values = [float(alpha) for alpha in np.atleast_1d(np.asarray(alphas, dtype=float))]
         found = []
         for alpha, solution in zip(values, self.equations_.path(values), strict=True):
@@ -156,6 +159,13 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _rows_a_block(self) -> int:
         return max(256, BLOCK_BYTES // (8 * max(1, len(self._weights))))
+
+    def _check_not_frozen(self) -> None:
+        if not hasattr(self, "equations_"):
+            raise ValueError(
+                f"expected a {type(self).__name__} that still holds its sums, got a frozen copy, which only predicts; "
+                "accumulate on the original, or fit anew"
+            )
 
     def _check_parameters(self) -> None:
         if not (np.isfinite(self.alpha) and self.alpha >= 0):

@@ -23,6 +23,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
 from scipy.linalg.blas import dsyrk
 
 Array = NDArray[np.float64]
+LOST = 100.0 * float(np.finfo(float).eps)  # share of a sum of squares that is rounding only
 
 
 class NormalEquations:
@@ -32,13 +33,14 @@ class NormalEquations:
         n_features: m.
         n_targets: d.
         intercept: whether there is a b.
-        shifted: take the sums about the first batch's mean. Features that are bounded near zero (cosines) need not.
+        shifted: take the features' sums about the first batch's mean; those that are bounded near zero (cosines) need
+            not. The targets' always are, where there is an intercept.
     """
 
     def __init__(
         self, n_features: int, n_targets: int, *, intercept: bool = True, shifted: bool = True
     ) -> None:
-        self.intercept, self.shifted = intercept, shifted and intercept
+        self.intercept, self._shifts_features = intercept, shifted and intercept
         self.weight = 0.0
         self.n_rows = 0
         self._gram = np.zeros((n_features, n_features), order="F")  # lower triangle of Z'WZ
@@ -56,12 +58,14 @@ class NormalEquations:
         if not len(features):
             return
         total = float(len(features)) if weights is None else float(weights.sum())
-        if self.shifted:
-            if self.n_rows == 0 and total > 0:
-                self._shift_z = np.average(features, axis=0, weights=weights)
+        if self.intercept:
+            if self.weight == 0 and total > 0:
                 self._shift_y = np.average(targets, axis=0, weights=weights)
-            features = features - self._shift_z
+                if self._shifts_features:
+                    self._shift_z = np.average(features, axis=0, weights=weights)
             targets = targets - self._shift_y
+            if self._shifts_features:
+                features = features - self._shift_z
         if self.intercept:
             self._sum_z += features.sum(axis=0) if weights is None else weights @ features
             self._sum_y += targets.sum(axis=0) if weights is None else weights @ targets
@@ -84,7 +88,7 @@ class NormalEquations:
         return other
 
     def solve(self, alpha: float) -> tuple[Array, Array]:
-        """The minimiser for one ridge value, by Cholesky; by the pseudo-inverse where that breaks down.
+        """The minimiser for one ridge value, by Cholesky; by the pseudo-inverse where a pivot is rounding only.
 
         Args:
             alpha: at least 0.
@@ -94,9 +98,12 @@ class NormalEquations:
         """
         gram, cross = self._centred()
         gram[np.diag_indices_from(gram)] += self.weight * alpha
+        squares = np.diag(gram).copy()
         try:
             factor = cho_factor(gram, lower=True, overwrite_a=True, check_finite=False)
         except LinAlgError:
+            return self.path([alpha])[0]
+        if (np.square(np.diag(factor[0])) <= LOST * len(gram) * squares).any():
             return self.path([alpha])[0]
         return self._with_intercept(cho_solve(factor, cross, check_finite=False))
 
@@ -114,7 +121,7 @@ class NormalEquations:
         gram, cross = self._centred()
         values, vectors = eigh(gram, lower=True, overwrite_a=True, check_finite=False)
         rotated = vectors.T @ cross
-        floor = np.finfo(float).eps * max(values[-1], 0.0) * len(values)
+        floor = LOST * len(values) * max(values[-1], 0.0)
         found = []
         for alpha in alphas:
             shrunk = np.maximum(values, 0.0) + self.weight * alpha
@@ -146,11 +153,13 @@ class NormalEquations:
         return max(float(total), 0.0) / self.weight
 
     def _centred(self) -> tuple[Array, Array]:
-        """Z'WZ (lower triangle) and Z'WY about the weighted means, as copies."""
+        """Z'WZ (lower triangle) and Z'WY about the weighted means, as copies; 0 for features that do not vary."""
         gram, cross = self._gram.copy(order="F"), self._cross.copy()
         if self.intercept and self.weight:
             gram -= np.outer(self._sum_z, self._sum_z / self.weight)
             cross -= np.outer(self._sum_z, self._sum_y / self.weight)
+            constant = np.diag(gram) <= LOST * np.diag(self._gram)
+            gram[constant], gram[:, constant], cross[constant] = 0.0, 0.0, 0.0
         return gram, cross
 
     def _with_intercept(self, weights: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from beliefgym.learning import RandomFourierRidge
 from beliefgym.scripts.reproductions import dad_data as data
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.dad_figures import STYLE, save
-from beliefgym.scripts.reproductions.dad_tuning import tune
+from beliefgym.scripts.reproductions.dad_tuning import TUNING_VERSION, tune
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
 Point = tuple[str, float, int, int]  # system, noise, frequencies, steps
@@ -28,6 +28,7 @@ POINTS: list[Point] = [
 ]
 SETTING = {
     "data_version": data.VERSION,
+    "tuning_version": TUNING_VERSION,
     "trajectories": 400,
     "bandwidths": [1.0, 2.0],
     "alphas": [1e-8, 1e-6, 1e-4],

@@ -17,7 +17,7 @@ from beliefgym.envs.simulated_flag import SimulatedFlag
 from beliefgym.learning import RandomForest, RandomFourierRidge
 from beliefgym.scripts.reproductions import dad_data as data
 from beliefgym.scripts.reproductions.cells import run_cells
-from beliefgym.scripts.reproductions.dad_tuning import tune
+from beliefgym.scripts.reproductions.dad_tuning import TUNING_VERSION, tune
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
 RFF, FOREST = "random Fourier features", "random forest"
@@ -37,7 +37,7 @@ THESIS: dict[tuple[str, str], float] = {
 TITLES = {"flag": "flag (simulated)"}
 RECORDED = ("pumpjack", "fireplace")
 N_ITERATIONS = {RFF: 25, FOREST: 10}
-SCREENING = {RFF: 4, FOREST: 2}
+SCREENING = {RFF: 3, FOREST: 2}
 BANDWIDTHS = (0.5, 1.0, 2.0, 4.0)  # times the square root of the number of components
 ALPHAS = (1e-8, 1e-6, 1e-4)
 LEAVES, DEPTHS = (1, 5), (12,)
@@ -223,6 +223,7 @@ def _settings(learner: str) -> dict[str, Any]:
         "horizons": [5, 10, None],
         "n_iterations": N_ITERATIONS[learner],
         "screening": SCREENING[learner],
+        "tuning_version": TUNING_VERSION,
     }
     if learner == RFF:
         return common | {"n_frequencies": 500, "bandwidths": list(BANDWIDTHS), "alphas": list(ALPHAS)}

@@ -21,6 +21,7 @@ from sklearn.base import clone
 from beliefgym.learning import DataAsDemonstrator, Sequences
 
 Options = Mapping[str, Any]
+TUNING_VERSION = 2  # of the protocol; cells made with another one run again
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,8 @@ def tune(
     *,
     n_iterations: int,
     screening: int,
-    screening_share: float = 0.4,
-    finalists: int = 3,
+    screening_share: float = 0.25,
+    finalists: int = 2,
     common: Options | None = None,
 ) -> Pair:
     """Tune both arms.

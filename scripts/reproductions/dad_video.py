@@ -24,12 +24,13 @@ from beliefgym.scripts.reproductions import dad_data as data
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.dad_figures import DAD, GRID, SINGLE, STYLE, TRUTH, save
 from beliefgym.scripts.reproductions.dad_table import ALPHAS, BANDWIDTHS, flag_video, present
-from beliefgym.scripts.reproductions.dad_tuning import tune
+from beliefgym.scripts.reproductions.dad_tuning import TUNING_VERSION, tune
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
 COLUMNS = ("what", "single step", "DaD", "improvement", "contrast single", "contrast DaD", "meets")
 SETTING: dict[str, Any] = {
     "data_version": data.VERSION,
+    "tuning_version": TUNING_VERSION,
     "n_frequencies": 500,
     "bandwidths": list(BANDWIDTHS),
     "alphas": list(ALPHAS),
