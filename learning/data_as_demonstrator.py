@@ -24,7 +24,7 @@ from sklearn.base import BaseEstimator
 from tqdm import tqdm
 
 from beliefgym.learning.aggregation import Algorithm, Learner, learner_for, predict_unchecked
-from beliefgym.learning.dynamics import DynamicsModel, Target
+from beliefgym.learning.dynamics import DynamicsModel, Standardise, Target
 from beliefgym.learning.random_fourier import RandomFourierRidge
 from beliefgym.learning.sequences import Sequences
 
@@ -69,7 +69,8 @@ class DataAsDemonstrator(DynamicsModel):
             same step. None keeps all.
         algorithm: "follow_the_leader" fits to the whole aggregate; "online_gradient" takes gradient steps.
         step_size: of "online_gradient", see `GradientSteps`.
-        standardise: bring the components of states and actions to one scale.
+        standardise: bring the components of states and actions to one scale: True each by its own standard deviation,
+            "together" all by one number (components of one unit, such as principal components), False not.
         use_actions: whether actions, where the trajectories have them, are inputs.
         divergence_limit: standard deviations of the training data beyond which a rollout is cut.
         progress_bar: show the iterations.
@@ -100,7 +101,7 @@ class DataAsDemonstrator(DynamicsModel):
         outlier_ratio: float | None = None,
         algorithm: Algorithm = "follow_the_leader",
         step_size: float = 1.0,
-        standardise: bool = True,
+        standardise: Standardise = True,
         use_actions: bool = True,
         divergence_limit: float = 100.0,
         progress_bar: bool = False,

@@ -11,6 +11,7 @@ Reference: thesis proposal, Secs. 3.1.1 and 3.2.3.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -24,6 +25,12 @@ from beliefgym.learning.standardisation import Standardisation
 
 Array = NDArray[np.float64]
 Target = Literal["delta", "next"]
+Standardise = bool | Literal["together"]
+STANDARDISATIONS: dict[Standardise, Callable[[Array], Standardisation]] = {
+    True: Standardisation.of,
+    "together": Standardisation.together,
+    False: Standardisation.none,
+}
 
 
 class DivergenceWarning(UserWarning):
@@ -41,7 +48,7 @@ class DynamicsModel(BaseEstimator):
     """
 
     target: Target
-    standardise: bool
+    standardise: Standardise
     use_actions: bool
     divergence_limit: float
     _fitted_attribute = "model_"  # there once a fit has given something to predict with
@@ -144,10 +151,12 @@ class DynamicsModel(BaseEstimator):
         rows = train.observations[train.observation_mask]
         spread = Standardisation.of(rows)
         steps = train.actions[train.step_mask][:, : self.n_act_]
-        if self.standardise:
-            self._observed, self._acted = spread, Standardisation.of(steps)
-        else:
-            self._observed, self._acted = Standardisation.none(self.n_obs_), Standardisation.none(self.n_act_)
+        scaled = STANDARDISATIONS.get(self.standardise)
+        if scaled is None:
+            raise ValueError(
+                f"expected standardise to be one of {list(STANDARDISATIONS)}, got {self.standardise!r}"
+            )
+        self._observed, self._acted = scaled(rows), scaled(steps)
         for what, names, constant in (
             ("observations", train.observation_names, spread.constant),
             ("actions", train.action_names, Standardisation.of(steps).constant),
@@ -162,9 +171,8 @@ class DynamicsModel(BaseEstimator):
         episode, time = np.nonzero(train.step_mask)
         z = self._observed.apply(train.observations)
         change = z[episode, time + 1] - z[episode, time]
-        self._change_scale = (
-            Standardisation.of(change).scale if self.target == "delta" else np.ones(self.n_obs_)
-        )
+        scaled = Standardisation.together if self.standardise == "together" else Standardisation.of
+        self._change_scale = scaled(change).scale if self.target == "delta" else np.ones(self.n_obs_)
 
     def _coordinates(self, sequences: Sequences) -> tuple[Array, Array]:
         """Standardised states (n, n_steps + 1, n_obs) and actions (n, n_steps, n_act)."""

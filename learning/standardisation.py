@@ -31,8 +31,17 @@ class Standardisation:
         return cls(offset, np.where(constant, 1.0, std), constant)
 
     @classmethod
-    def none(cls, d: int) -> Standardisation:
+    def together(cls, rows: Array) -> Standardisation:
+        """Mean 0, and one scale for all components, their root mean square deviation: components of one unit."""
+        each = cls.of(rows)
+        deviation = np.where(each.constant, 0.0, each.scale)
+        common = float(np.sqrt(np.square(deviation).mean())) if len(deviation) else 1.0
+        return cls(each.offset, np.full(len(deviation), common if common > 0 else 1.0), each.constant)
+
+    @classmethod
+    def none(cls, rows: Array) -> Standardisation:
         """The identity."""
+        d = rows.shape[1]
         return cls(np.zeros(d), np.ones(d), np.zeros(d, dtype=np.bool_))
 
     def apply(self, x: Array) -> Array:

@@ -7,8 +7,11 @@ one result with the reason, and runs again the next time.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import signal
+import sys
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -17,9 +20,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from beliefgym.scripts.training import git_commit, machine, versions
-
 Cell = Mapping[str, Any]
+PR_SET_PDEATHSIG = 1  # from <sys/prctl.h>
 
 
 def run_cells(
@@ -60,7 +62,9 @@ def run_cells(
             found[name] = _kept(folder, name, cell, _run(function, cell, extra))
             told(f"{name} ({len(found)} of {len(cells)})")
     elif missing:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+        with ProcessPoolExecutor(
+            jobs, mp_context=get_context("spawn"), max_tasks_per_child=1, initializer=_end_with_parent
+        ) as pool:
             futures = {pool.submit(_run, function, cell, extra): name for name, cell in missing.items()}
             for future in as_completed(futures):
                 name = futures[future]
@@ -71,6 +75,12 @@ def run_cells(
                 found[name] = _kept(folder, name, missing[name], result)
                 told(f"{name} ({len(found)} of {len(cells)})")
     return {name: found[name] for name in cells}
+
+
+def _end_with_parent() -> None:
+    """On Linux the kernel kills a cell whose main process is gone, however that went."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _run(function: str, cell: Cell, extra: Any) -> dict[str, Any]:
@@ -84,6 +94,8 @@ def _run(function: str, cell: Cell, extra: Any) -> dict[str, Any]:
 def _kept(folder: Path, name: str, cell: Cell, result: dict[str, Any]) -> dict[str, Any]:
     if "failed" in result:
         return result
+    from beliefgym.scripts.training import git_commit, machine, versions  # heavy, and no cell needs it
+
     record = {
         "cell": dict(cell),
         "result": result,

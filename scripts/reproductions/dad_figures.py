@@ -19,7 +19,7 @@ from beliefgym.scripts.leaderboard.plots import FAINT, GRID, INK, PALETTE, STYLE
 
 SINGLE, DAD, TRUTH = PALETTE[1], PALETTE[0], INK
 STEPS = (1, 8, 16, 23, 30)  # those of Fig. 3.2
-Cells = dict[str, dict[str, Any]]
+Groups = dict[str, list[dict[str, Any]]]
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -37,8 +37,15 @@ def plain(axes: Axes, title: str, x: str, y: str) -> None:
     axes.set_axisbelow(True)
 
 
-def table_figures(rows: list[dict[str, Any]], found: Cells, cells: Cells, folder: Path) -> dict[str, str]:
-    """All figures of `dad-table`; file name -> caption."""
+def table_figures(rows: list[dict[str, Any]], groups: Groups, folder: Path) -> dict[str, str]:
+    """All figures of `dad-table` into the folder.
+
+    Args:
+        rows: of the table. groups: title of a row -> results of its seeds.
+
+    Returns:
+        file name -> caption.
+    """
     made = {}
     with matplotlib.rc_context(STYLE):
         shown = [row for row in rows if "values" in row]
@@ -47,23 +54,22 @@ def table_figures(rows: list[dict[str, Any]], found: Cells, cells: Cells, folder
             made["dad-table-errors.png"] = (
                 "Multi-step error on test trajectories, mean and 95 % interval over seeds (after Fig. 3.8)."
             )
-        groups = _groups(found, cells)
         if groups:
-            save(horizon_figure(groups), folder / "dad-table-horizon.png")
+            short = {name.replace("random Fourier features", "RFF"): group for name, group in groups.items()}
+            save(horizon_figure(short), folder / "dad-table-horizon.png")
             made["dad-table-horizon.png"] = (
-                "Error after each predicted step, as a share of the signal's power there; seeds thin, their mean thick."
+                "Error after each predicted step, as a share of the signal's power; seeds thin, their mean thick."
             )
-            save(iterations_figure(groups), folder / "dad-table-iterations.png")
+            save(iterations_figure(short), folder / "dad-table-iterations.png")
             made["dad-table-iterations.png"] = (
                 "DaD's iterations at the first seed: multi-step error (after Fig. 3.3) above, single-step loss on the "
                 "aggregate (after Fig. 3.4) below; the ring is the model that validation chose."
             )
         for system in ("pendulum", "cart-pole"):
-            held = [result["shown"] for name, result in found.items() if name.startswith(f"{system}-rff")]
+            held = [result["shown"] for result in groups.get(f"{system}, random Fourier features", [])]
             if held:
-                file = f"dad-table-{system}.png"
+                file, steps = f"dad-table-{system}.png", ", ".join(map(str, STEPS))
                 save(motion_figure(system, held[0]), folder / file)
-                steps = ", ".join(map(str, STEPS))
                 made[file] = f"A test trajectory of the {system} at steps {steps} (after Fig. 3.2)."
     return made
 
@@ -92,7 +98,7 @@ def errors_figure(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def horizon_figure(groups: dict[str, list[dict[str, Any]]]) -> Figure:
+def horizon_figure(groups: Groups) -> Figure:
     """Error after each step, a small plot for each system and learner."""
     figure, grid = _grid(len(groups))
     for axes, (title, results) in zip(grid, groups.items(), strict=False):
@@ -109,7 +115,7 @@ def horizon_figure(groups: dict[str, list[dict[str, Any]]]) -> Figure:
     return figure
 
 
-def iterations_figure(groups: dict[str, list[dict[str, Any]]]) -> Figure:
+def iterations_figure(groups: Groups) -> Figure:
     """Multi-step error and aggregate's single-step loss over DaD's iterations, first seed."""
     n = len(groups)
     figure = Figure(figsize=(2.6 * n + 0.4, 5.0), layout="constrained")
@@ -152,22 +158,16 @@ def motion_figure(system: str, shown: dict[str, Any]) -> Figure:
     return figure
 
 
-def picture(system: str, state: NDArray[np.float64], size: int = 220) -> NDArray[np.uint8]:
-    """One state as its environment draws it."""
+def picture(system: str, shown: NDArray[np.float64], size: int = 220) -> NDArray[np.uint8]:
+    """One state as its environment draws it, from what the environment shows; a tip off its circle is drawn there."""
     canvas = Canvas(size, size)
     if system == "pendulum":
-        Pendulum.uncontrolled().draw(canvas, state + np.array([np.pi, 0.0]), None)
+        Pendulum.uncontrolled().draw(canvas, np.array([np.arctan2(shown[1], shown[0]), shown[2]]), None)
+        canvas.circle((float(shown[1]), float(shown[0])), 0.06, "force")
     else:
-        CartPole().draw(canvas, state, None)
+        x, cosine, sine, velocity, turning = shown
+        CartPole().draw(canvas, np.array([x, velocity, np.arctan2(sine, cosine), turning]), None)
     return canvas.image()
-
-
-def _groups(found: Cells, cells: Cells) -> dict[str, list[dict[str, Any]]]:
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for name, result in found.items():
-        learner = "RFF" if "rff" in name else "forest"
-        groups.setdefault(f"{cells[name]['system']}, {learner}", []).append(result)
-    return groups
 
 
 def _grid(n: int, columns: int = 4) -> tuple[Figure, list[Axes]]:

@@ -23,7 +23,7 @@ from beliefgym.learning.video_frames import read_frames
 from beliefgym.scripts.reproductions import dad_data as data
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.dad_figures import DAD, GRID, SINGLE, STYLE, TRUTH, save
-from beliefgym.scripts.reproductions.dad_table import ALPHAS, BANDWIDTHS, flag_video, present
+from beliefgym.scripts.reproductions.dad_table import VIDEO_ALPHAS, VIDEO_BANDWIDTHS, flag_video, present
 from beliefgym.scripts.reproductions.dad_tuning import TUNING_VERSION, tune
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
@@ -31,12 +31,12 @@ COLUMNS = ("what", "single step", "DaD", "improvement", "contrast single", "cont
 SETTING: dict[str, Any] = {
     "data_version": data.VERSION,
     "tuning_version": TUNING_VERSION,
-    "n_frequencies": 500,
-    "bandwidths": list(BANDWIDTHS),
-    "alphas": list(ALPHAS),
+    "n_frequencies": 200,
+    "bandwidths": list(VIDEO_BANDWIDTHS),
+    "alphas": list(VIDEO_ALPHAS),
     "horizons": [5, 10, None],
-    "n_iterations": 25,
-    "screening": 4,
+    "n_iterations": 15,
+    "screening": 3,
 }
 SHOWN = 5  # frames of a trajectory in a figure
 LONG_ENOUGH = 600  # frames of a user's video from which on every fifth is taken
@@ -120,6 +120,7 @@ def cell(cell: dict[str, Any], sources: dict[str, str]) -> dict[str, Any]:
         [{"horizon": horizon} for horizon in cell["horizons"]],
         n_iterations=cell["n_iterations"],
         screening=cell["screening"],
+        common={"standardise": "together"},
     )
     result: dict[str, Any] = {"explained_variance": texture.explained_variance}
     shown = len(test) // 2
