@@ -40,7 +40,7 @@ def test_one_delay_changes_nothing(sequences):
 
 
 def test_positions_alone_become_predictable():
-    """A harmonic motion seen by position obeys x_{t+1} = 2 cos(w) x_t - x_{t-1}: exact with two delays, not with one."""
+    """A harmonic motion seen by position obeys x_{t+1} = 2 cos(w) x_t - x_{t-1}: exact with two delays only."""
     phase = np.random.default_rng(0).uniform(0, 6.28, (20, 1))
     seen = Sequences.from_observations(np.sin(0.3 * np.arange(41) + phase)[:, :, None])
     errors = []
