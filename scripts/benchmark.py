@@ -14,7 +14,10 @@ from rich.table import Table
 from beliefgym.scripts.named_record import check_name, markdown_table, write_record
 from beliefgym.scripts.training import machine
 
-BENCHMARKS = {"env": "beliefgym.scripts.benchmarks.env:run"}
+BENCHMARKS = {
+    "env": "beliefgym.scripts.benchmarks.env:run",
+    "dad": "beliefgym.scripts.benchmarks.dad:run",
+}
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Benchmark:
     """
 
     name: tyro.conf.Positional[str]
-    """Which: env."""
+    """Which: env, dad."""
     results: Path = Path("results")
     """Folder; NAME.json and NAME.md are written to its benchmark/."""
 
