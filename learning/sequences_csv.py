@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import os
-import secrets
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from beliefgym.learning.csv_table import Columns, Rows, read_rows
 from beliefgym.learning.sequences import Sequences
+from beliefgym.learning.whole_files import written_whole
 
 _MOST_NAMED = 3  # dropped pieces that a warning names
 
@@ -145,20 +145,15 @@ def to_csv(sequences: Sequences, path: FilePath) -> Path:
     header += ["reward"]
     if repeated := sorted({name for name in header if header.count(name) > 1}):
         raise ValueError(f"expected each column name once, got {repeated} more than once; rename components")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with open(temporary, "x", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(header)
-            for number, one in enumerate(sequences.to_episodes()):
-                taken = np.column_stack([one["actions"], one["rewards"]]).tolist()
-                taken.append([""] * (sequences.n_act + 1))
-                for step, seen in enumerate(one["observations"].tolist()):
-                    at = [number, step] if dt is None else [number, step, step * dt]
-                    writer.writerow([*at, *seen, *taken[step]])
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with written_whole(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        for number, one in enumerate(sequences.to_episodes()):
+            taken = np.column_stack([one["actions"], one["rewards"]]).tolist()
+            taken.append([""] * (sequences.n_act + 1))
+            for step, seen in enumerate(one["observations"].tolist()):
+                at = [number, step] if dt is None else [number, step, step * dt]
+                writer.writerow([*at, *seen, *taken[step]])
     return path
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import zipfile
 import zlib
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 
 from beliefgym.learning.sequence_checks import ARRAYS, NAMES_FIELDS, nearest
 from beliefgym.learning.sequences import Sequences
+from beliefgym.learning.whole_files import written_whole
 
 FORMAT_VERSION = 1
 HEADER = "beliefgym_sequences"
@@ -52,15 +52,8 @@ def save_npz(sequences: Sequences, path: str | os.PathLike[str]) -> Path:
     }
     arrays: dict[str, Any] = {HEADER: np.array(json.dumps(header))}
     arrays |= {name: getattr(sequences, name) for name in (*held, "lengths", "terminated")}
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with open(temporary, "xb") as file:
-            np.savez_compressed(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with written_whole(path) as file:
+        np.savez_compressed(file, **arrays)
     return path
 
 

@@ -17,7 +17,6 @@ that overlap; and these start at any frame, so that all five phases of "every fi
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from beliefgym.learning.sequences import Sequences
 from beliefgym.learning.video_frames import Frames
+from beliefgym.learning.whole_files import written_whole
 
 Array = NDArray[np.float64]
 
@@ -188,14 +188,9 @@ class VideoTexture(BaseEstimator):
         """Write the fitted components to one .npz file (the name is used as it is); returns the path."""
         check_is_fitted(self, "components_")
         path = Path(path)
-        temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-        try:
-            with open(temporary, "xb") as file:
-                arrays: dict[str, Any] = {name: getattr(self, name) for name in _FILE_ARRAYS}
-                np.savez_compressed(file, n_components=self.n_components, **arrays)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with written_whole(path) as file:
+            arrays: dict[str, Any] = {name: getattr(self, name) for name in _FILE_ARRAYS}
+            np.savez_compressed(file, n_components=self.n_components, **arrays)
         return path
 
     @classmethod
