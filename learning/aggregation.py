@@ -53,7 +53,7 @@ class Learner(Protocol):
         """The present model as a fitted regressor that later calls do not touch."""
 
 
-def learner_for(regressor: Any, algorithm: Algorithm, X: Array, Y: Array, step_size: float = 1.0) -> Learner:
+def learner_for(regressor: Any, algorithm: Algorithm, X: Array, Y: Array, step_size: float = 0.1) -> Learner:
     """The learner that suits a regressor, started on a first data set and fitted to it.
 
     Args:

@@ -67,8 +67,11 @@ class DataAsDemonstrator(DynamicsModel):
             deviations, as root mean square over components. None keeps all.
         outlier_ratio: leave out predictions farther off than this many times the mean error of all rollouts at the
             same step. None keeps all.
-        algorithm: "follow_the_leader" fits to the whole aggregate; "online_gradient" takes gradient steps.
-        step_size: of "online_gradient", see `GradientSteps`.
+        algorithm: "follow_the_leader" fits to the whole aggregate; "online_gradient" takes gradient steps, which need
+            neither the aggregate nor its sums, and on features as correlated as random Fourier features move little
+            (a few per cent where follow-the-leader halves the error); where sums fit into memory, take the former.
+        step_size: of "online_gradient", see `GradientSteps`. From about 0.3 on corrections far from the truth can
+            make the model diverge (counted, and not chosen).
         standardise: bring the components of states and actions to one scale: True each by its own standard deviation,
             "together" all by one number (components of one unit, such as principal components), False not.
         use_actions: whether actions, where the trajectories have them, are inputs.
@@ -100,7 +103,7 @@ class DataAsDemonstrator(DynamicsModel):
         outlier_threshold: float | None = None,
         outlier_ratio: float | None = None,
         algorithm: Algorithm = "follow_the_leader",
-        step_size: float = 1.0,
+        step_size: float = 0.1,
         standardise: Standardise = True,
         use_actions: bool = True,
         divergence_limit: float = 100.0,
