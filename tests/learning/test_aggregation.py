@@ -235,7 +235,7 @@ def test_the_average_regret_of_online_gradient_falls(regressor):
     for n in (10, 100, 1000):
         rng = np.random.default_rng(1)
         elsewhere = stream(rng, truth=np.ones((3, 2)))
-        learner = learner_for(regressor, "online_gradient", *elsewhere)
+        learner = learner_for(regressor, "online_gradient", *elsewhere, step_size=1.0)
         batches = [stream(rng, n=20) for _ in range(n)]
         for X, Y in batches:
             learner.add(learner.encode(X), Y)
