@@ -17,6 +17,7 @@ from sklearn.utils import check_random_state
 from beliefgym.learning.linear_in_features import LinearInFeatures
 
 Array = NDArray[np.float64]
+CACHED = 2**15  # numbers of a block: 256 KiB
 
 
 class RandomFourierRidge(LinearInFeatures):
@@ -71,8 +72,7 @@ class RandomFourierRidge(LinearInFeatures):
         phi = np.empty((len(X), start + 2 * m))
         if start:
             phi[:, :start] = X
-        cosine_and_sine(X @ self.frequencies_, phi[:, start : start + m], phi[:, start + m :])
-        phi[:, start:] *= m**-0.5
+        cosine_and_sine(X @ self.frequencies_, phi[:, start : start + m], phi[:, start + m :], m**-0.5)
         return phi
 
     def _check_parameters(self) -> None:
@@ -83,19 +83,26 @@ class RandomFourierRidge(LinearInFeatures):
             raise ValueError(f"expected bandwidth finite and above 0, got {self.bandwidth!r}")
 
 
-def cosine_and_sine(angle: Array, cosine: Array, sine: Array) -> None:
+def cosine_and_sine(angle: Array, cosine: Array, sine: Array, factor: float = 1.0) -> None:
     """cos and sin from one tangent: with t = tan(angle / 2), cos = (1 - t^2)/(1 + t^2), sin = 2 t/(1 + t^2).
 
     As exact as two calls (to 3e-16), and six times faster where numpy has a vectorised tangent and none of the others.
+    It goes through blocks of rows that stay in the processor's cache.
 
     Args:
-        angle: (n, m), overwritten. cosine, sine: (n, m), written to.
+        angle: (n, m), overwritten. cosine, sine: (n, m), written to. factor: of both.
     """
-    angle *= 0.5
-    t = np.tan(angle, out=angle)
-    np.multiply(t, t, out=cosine)
-    inverse = 1.0 / (1.0 + cosine)
-    np.subtract(1.0, cosine, out=cosine)
-    cosine *= inverse
-    np.multiply(t, inverse, out=sine)
-    sine *= 2.0
+    rows = max(1, CACHED // max(1, angle.shape[1]))
+    scratch = np.empty((min(rows, len(angle)), angle.shape[1]))
+    for i in range(0, len(angle), rows):
+        t, c, s = angle[i : i + rows], cosine[i : i + rows], sine[i : i + rows]
+        inverse = scratch[: len(t)]
+        t *= 0.5
+        np.tan(t, out=t)
+        np.multiply(t, t, out=inverse)
+        np.subtract(1.0, inverse, out=c)
+        inverse += 1.0
+        np.divide(factor, inverse, out=inverse)
+        c *= inverse
+        t *= 2.0
+        np.multiply(t, inverse, out=s)

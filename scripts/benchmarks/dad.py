@@ -105,7 +105,9 @@ def ours(sequences: Sequences, n_iterations: int = N_ITERATIONS) -> tuple[list[f
     regressor = RandomFourierRidge(
         n_frequencies=M, bandwidth=BANDWIDTH, alpha=ALPHA, fit_intercept=False, random_state=0
     )
-    model = DataAsDemonstrator(regressor, n_iterations=n_iterations, target="next").fit(sequences)
+    model = DataAsDemonstrator(regressor, n_iterations=n_iterations, target="next", horizon=None).fit(
+        sequences
+    )
     return model.history_["train_multi_step"].tolist(), model.history_["seconds"].tolist()
 
 
