@@ -1,7 +1,7 @@
 """A simulated flag in the wind: a video texture made by physics, where no recorded video is at hand.
 
-It stands in for the recorded 'Flag' of the thesis proposal's Sec. 3.1.3 and is not it: wherever frames or scores of it are
-shown they are to be called simulated. A rectangular cloth, its hoist pinned to a pole, is a 2-D flex of MuJoCo:
+It stands in for the recorded 'Flag' of the thesis proposal's Sec. 3.1.3 and is not it: wherever frames or scores of it
+are shown they are to be called simulated. A rectangular cloth, its hoist pinned to a pole, is a 2-D flex of MuJoCo:
 triangles with membrane and bending elasticity and Rayleigh damping. MuJoCo's own fluid forces act on bodies with
 geoms, not on a flex; so each triangle of area A and unit normal n, in air that moves at v relative to it, gets
 
