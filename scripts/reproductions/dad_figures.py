@@ -12,7 +12,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from beliefgym.envs.cart_pole import CartPole
 from beliefgym.envs.pendulum import Pendulum
 from beliefgym.envs.rendering import Canvas
 from beliefgym.scripts.leaderboard.plots import FAINT, GRID, INK, PALETTE, STYLE
@@ -65,12 +64,6 @@ def table_figures(rows: list[dict[str, Any]], groups: Groups, folder: Path) -> d
                 "DaD's iterations at the first seed: multi-step error (after Fig. 3.3) above, single-step loss on the "
                 "aggregate (after Fig. 3.4) below; the ring is the model that validation chose."
             )
-        for system in ("pendulum", "cart-pole"):
-            held = [result["shown"] for result in groups.get(f"{system}, random Fourier features", [])]
-            if held:
-                file, steps = f"dad-table-{system}.png", ", ".join(map(str, STEPS))
-                save(motion_figure(system, held[0]), folder / file)
-                made[file] = f"A test trajectory of the {system} at steps {steps} (after Fig. 3.2)."
     return made
 
 
@@ -85,7 +78,7 @@ def errors_figure(rows: list[dict[str, Any]]) -> Figure:
         spread = np.nan_to_num(np.clip(np.array([value - low, high - value]), 0, None))
         spread[0] = np.minimum(spread[0], 0.98 * value)
         axes.barh(place + shift, value, 0.36, color=colour, label=label, xerr=spread, error_kw={"lw": 1.2})
-    axes.set_yticks(place, [row["what"] for row in rows])
+    axes.set_yticks(place, [row["what"].replace("random Fourier features", "RFF") for row in rows])
     axes.invert_yaxis()
     axes.set_xscale("log")
     for at, row in zip(place, rows, strict=True):
@@ -93,7 +86,12 @@ def errors_figure(rows: list[dict[str, Any]]) -> Figure:
         axes.text(
             1.01, float(at), f"{gain:+.0f} %", transform=axes.get_yaxis_transform(), va="center", color=FAINT
         )
-    plain(axes, "Multi-step error on test trajectories (RMSE / signal power); right: improvement", "", "")
+    plain(
+        axes,
+        "",
+        "multi-step error / signal power; at the right: improvement",
+        "",
+    )
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
@@ -109,7 +107,7 @@ def horizon_figure(groups: Groups) -> Figure:
             steps = np.arange(1, curves.shape[1] + 1)
             axes.plot(steps, curves.T, color=colour, linewidth=0.6, alpha=0.45)
             axes.plot(steps, curves.mean(axis=0), color=colour, linewidth=2, label=label)
-        plain(axes, title, "step", "error / power")
+        plain(axes, _broken(title), "step", "error / power")
         axes.set_yscale("log")
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
@@ -127,7 +125,7 @@ def iterations_figure(groups: Groups) -> Figure:
         above.plot(history["iteration"], history["validation_multi_step"], color=DAD, label="validation")
         above.plot(best, history["validation_multi_step"][best], "o", ms=9, mfc="none", mec=DAD)
         below.plot(history["iteration"], history["aggregate_single_step"], color=INK)
-        plain(above, title.replace(", ", "\n"), "", "multi-step error" if not column else "")
+        plain(above, _broken(title), "", "multi-step error" if not column else "")
         plain(below, "", "iteration", "loss on the aggregate" if not column else "")
         above.set_yscale("log")
         below.set_yscale("log")
@@ -135,17 +133,19 @@ def iterations_figure(groups: Groups) -> Figure:
     return figure
 
 
-def motion_figure(system: str, shown: dict[str, Any]) -> Figure:
-    """Pictures of the true, the single-step and DaD's predicted states at five steps."""
-    rows = (("truth", TRUTH), ("single", SINGLE), ("dad", DAD))
-    names = {"truth": "true", "single": "single step", "dad": "DaD"}
+def motion_figure(states: dict[str, NDArray[np.float64]]) -> Figure:
+    """The free pendulum at five steps: the truth, the single-step model's and DaD's predictions.
+
+    Args:
+        states: "truth", "single", "dad" -> (31, 3) cos, sin, velocity, as the environment shows them.
+    """
+    rows = (("truth", "true", TRUTH), ("single", "single step", SINGLE), ("dad", "DaD", DAD))
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     grid = figure.subplots(3, len(STEPS))
-    for r, (arm, colour) in enumerate(rows):
-        states = np.array(shown[arm])
+    for r, (arm, label, colour) in enumerate(rows):
         for c, step in enumerate(STEPS):
             axes = grid[r, c]
-            axes.imshow(picture(system, states[step]))
+            axes.imshow(picture(states[arm][step]))
             axes.set_xticks([])
             axes.set_yticks([])
             for spine in axes.spines.values():
@@ -154,20 +154,22 @@ def motion_figure(system: str, shown: dict[str, Any]) -> Figure:
             if r == 0:
                 axes.set_title(f"step {step}", fontsize=10)
             if c == 0:
-                axes.set_ylabel(names[arm], color=colour, fontsize=11)
+                axes.set_ylabel(label, color=colour, fontsize=11)
     return figure
 
 
-def picture(system: str, shown: NDArray[np.float64], size: int = 220) -> NDArray[np.uint8]:
-    """One state as its environment draws it, from what the environment shows; a tip off its circle is drawn there."""
+def picture(shown: NDArray[np.float64], size: int = 220) -> NDArray[np.uint8]:
+    """A pendulum as its environment draws it, and a dot where its tip is predicted, on the circle or off it."""
     canvas = Canvas(size, size)
-    if system == "pendulum":
-        Pendulum.uncontrolled().draw(canvas, np.array([np.arctan2(shown[1], shown[0]), shown[2]]), None)
-        canvas.circle((float(shown[1]), float(shown[0])), 0.06, "force")
-    else:
-        x, cosine, sine, velocity, turning = shown
-        CartPole().draw(canvas, np.array([x, velocity, np.arctan2(sine, cosine), turning]), None)
+    Pendulum.uncontrolled().draw(canvas, np.array([np.arctan2(shown[1], shown[0]), shown[2]]), None)
+    canvas.circle((float(shown[1]), float(shown[0])), 0.06, "force")
     return canvas.image()
+
+
+def _broken(title: str) -> str:
+    """A row's title in at most two lines."""
+    system, _, rest = title.partition(", ")
+    return f"{system}\n{rest}"
 
 
 def _grid(n: int, columns: int = 4) -> tuple[Figure, list[Axes]]:

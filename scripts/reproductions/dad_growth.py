@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from beliefgym.learning import DataAsDemonstrator, PolynomialRidge
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.dad_data import VERSION, simulated_parts
-from beliefgym.scripts.reproductions.dad_figures import DAD, FAINT, SINGLE, STYLE, plain, save
+from beliefgym.scripts.reproductions.dad_figures import (
+    DAD,
+    FAINT,
+    SINGLE,
+    STEPS,
+    STYLE,
+    motion_figure,
+    plain,
+    save,
+)
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
 Array = NDArray[np.float64]
@@ -34,6 +43,7 @@ SETTING = {
     "n_iterations": 40,
     "horizon": 10,
 }
+MOTION = "dad-growth-pendulum.png"
 EARLY = 10  # steps over which the single-step model's error grows before it saturates
 COLUMNS = ("what", "single step", "DaD", "expected", "meets")
 
@@ -50,13 +60,20 @@ def run(request: Request) -> Report:
     if not results:
         raise ValueError(f"no seed could be run: {next(iter(found.values()))['failed']}")
     curves = {arm: np.array([result[arm] for result in results]) for arm in ("single", "dad")}
-    with matplotlib.rc_context(STYLE):
-        save(growth_figure(curves, results), request.folder / "dad-growth.png")
     caption = (
         "Left: Theorem 3.1.1's own example. Middle and right: median over seeds of the error after t steps, "
         "logarithmic and linear; thin lines are seeds."
     )
-    return Report(ABOUT, COLUMNS, rows(curves, results), SETTING, {"dad-growth.png": caption}, NOTES)
+    with matplotlib.rc_context(STYLE):
+        save(growth_figure(curves), request.folder / "dad-growth.png")
+        save(motion_figure({k: np.array(v) for k, v in results[0]["shown"].items()}), request.folder / MOTION)
+    steps = ", ".join(map(str, STEPS))
+    figures = {
+        "dad-growth.png": caption,
+        MOTION: f"A test trajectory at steps {steps} (after Fig. 3.2); the dot is the tip as predicted, on its circle "
+        "or off it.",
+    }
+    return Report(ABOUT, COLUMNS, rows(curves, results), SETTING, figures, NOTES)
 
 
 ABOUT = (
@@ -126,6 +143,9 @@ def cell(cell: dict[str, Any], extra: Any) -> dict[str, Any]:
     """Errors after each step of both models at one seed."""
     train, validation, test = simulated_parts("pendulum", cell["seed"], n=cell["n"], n_steps=cell["n_steps"])
     result: dict[str, Any] = {}
+    shown = int(np.argsort(test.observations[:, 0, 0])[len(test) // 2])  # starts half way up
+    last = max(STEPS)
+    result["shown"] = {"truth": test.observations[shown, : last + 1].tolist()}
     for arm, options in (
         ("single", {"n_iterations": 0}),
         ("dad", {"n_iterations": cell["n_iterations"], "horizon": cell["horizon"]}),
@@ -134,6 +154,7 @@ def cell(cell: dict[str, Any], extra: Any) -> dict[str, Any]:
         model = DataAsDemonstrator(regressor, target="next", **options).fit(train, validation)
         predicted = _quiet_rollout(model, test.observations[:, 0], cell["n_steps"])
         error = np.linalg.norm(predicted[:, 1:] - test.observations[:, 1:], axis=2)
+        result["shown"][arm] = predicted[shown, : last + 1].tolist()
         result[arm] = np.median(error, axis=0).tolist()
         result[f"lipschitz_{arm}"] = float(
             np.percentile(_stretch(model, predicted[:, :-1].reshape(-1, 3)), 99)
@@ -142,7 +163,7 @@ def cell(cell: dict[str, Any], extra: Any) -> dict[str, Any]:
     return result
 
 
-def growth_figure(curves: dict[str, Array], results: list[dict[str, Any]]) -> Figure:
+def growth_figure(curves: dict[str, Array]) -> Figure:
     """The theorem's example, and the learned models' errors on two scales."""
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
     example, logarithmic, linear = figure.subplots(1, 3)

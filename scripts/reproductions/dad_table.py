@@ -1,8 +1,8 @@
 """`beliefgym reproduce dad-table`: Data as Demonstrator against single-step training, beside the thesis's Table 3.1.
 
 Every system, both learners, both arms tuned alike (dad_tuning.py), on test trajectories that nothing was chosen on;
-figures of the errors (Fig. 3.8), of the error over the horizon, of the iterations (Figs. 3.3 and 3.4), and of
-trajectories at steps 1, 8, 16, 23 and 30 (Fig. 3.2).
+figures of the errors (Fig. 3.8), of the error over the horizon, and of the iterations (Figs. 3.3 and 3.4). The pictures
+of Fig. 3.2 are in dad_growth.py, those of the videos in dad_video.py.
 """
 
 from __future__ import annotations
@@ -200,18 +200,6 @@ def cell(cell: dict[str, Any], paths: dict[str, Any]) -> dict[str, Any]:
     result["dad"]["history"] = {k: v.tolist() for k, v in pair.dad.model.history_.items()}
     result["n_test"] = len(test)
     result["n_train_pairs"] = train.n_transitions
-    if system in ("pendulum", "cart-pole"):
-        errors_single = pair.single.model.errors(test).normalised
-        shown = int(
-            np.argsort(errors_single)[round(0.8 * len(test))]
-        )  # one that single step finds rather hard
-        start = test.observations[shown, 0]
-        n_steps = int(test.lengths[shown])
-        result["shown"] = {
-            "truth": test.observations[shown, : n_steps + 1].tolist(),
-            "single": pair.single.model.rollout(start, n_steps).tolist(),
-            "dad": pair.dad.model.rollout(start, n_steps).tolist(),
-        }
     return result
 
 
