@@ -29,6 +29,7 @@ from beliefgym.learning.random_fourier import RandomFourierRidge
 from beliefgym.learning.sequences import Sequences
 
 Array = NDArray[np.float64]
+ROWS = 8192  # rollouts whose features are held at once
 HISTORY = (
     "iteration",
     "train_multi_step",
@@ -202,16 +203,19 @@ class DataAsDemonstrator(DynamicsModel):
             going = going[rollouts.lengths[going] > t]
             if not len(going):
                 continue
-            now = predicted[going, t]
-            code = learner.encode(np.concatenate([now, u[going, t]], axis=1))
-            z_next = self._next(now, learner.predict(code))
+            now, action = predicted[going, t], u[going, t]
+            kept = self._not_outlying(now, z[going, t]) if t else np.zeros(len(going), dtype=np.bool_)
+            target = self._targets(now, z[going, t + 1])
+            z_next = np.empty_like(now)
+            for start in range(0, len(going), ROWS):
+                block = slice(start, start + ROWS)
+                code = learner.encode(np.concatenate([now[block], action[block]], axis=1))
+                z_next[block] = self._next(now[block], learner.predict(code))
+                if kept[block].all():
+                    learner.add(code, target[block])
+                elif t:
+                    learner.add(code[kept[block]], target[block][kept[block]])
             if t:
-                kept = self._not_outlying(now, z[going, t])
-                target = self._targets(now, z[going, t + 1])
-                if kept.all():
-                    learner.add(code, target)
-                else:
-                    learner.add(code[kept], target[kept])
                 counts["n_added"] += int(np.count_nonzero(kept))
                 counts["n_outlying"] += int(np.count_nonzero(~kept))
             inside = self._inside(z_next)

@@ -20,6 +20,7 @@ from beliefgym.learning import (
     RandomFourierRidge,
     Ridge,
     Sequences,
+    data_as_demonstrator,
 )
 
 LENGTHS = (9, 4, 1, 0, 12, 7, 11)
@@ -281,3 +282,14 @@ def test_a_fit_that_failed_leaves_no_model():
         model.fit(oscillator())
     with pytest.raises(NotFittedError):
         model.predict(np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("limits", [{}, {"outlier_threshold": 0.5, "outlier_ratio": 1.2}], ids=repr)
+def test_many_rollouts_go_in_blocks_without_a_difference(limits, monkeypatch):
+    train, validation = oscillator(), oscillator(seed=1)
+    whole = DataAsDemonstrator(Ridge(), n_iterations=4, **limits).fit(train, validation)
+    monkeypatch.setattr(data_as_demonstrator, "ROWS", 2)
+    blocks = DataAsDemonstrator(Ridge(), n_iterations=4, **limits).fit(train, validation)
+    for name, values in whole.history_.items():
+        if name != "seconds":  # sums in another order
+            np.testing.assert_allclose(blocks.history_[name], values, rtol=1e-9, atol=1e-13, err_msg=name)
