@@ -1,23 +1,18 @@
-"""Sequence data and the models fitted to it; knows no Gymnasium."""
+"""Sequence data and the models fitted to it; knows no Gymnasium.
 
+The data's names are imported with the package; a model's name imports its module when it is asked for, since
+scikit-learn and torch take a second that somebody who only steps environments need not wait for.
+"""
+
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beliefgym.learning.data_as_demonstrator import DataAsDemonstrator
 from beliefgym.learning.delay_embedding import delay_embedding
-from beliefgym.learning.direct_multi_step import DirectMultiStep
-from beliefgym.learning.dynamics import DivergenceWarning, DynamicsModel
-from beliefgym.learning.linear_in_features import Ridge
-from beliefgym.learning.multi_step_error import MultiStepErrors, multi_step_errors
-from beliefgym.learning.polynomial import PolynomialRidge
-from beliefgym.learning.random_forest import RandomForest
-from beliefgym.learning.random_fourier import RandomFourierRidge
-from beliefgym.learning.scheduled_sampling import ScheduledSampling
 from beliefgym.learning.sequences import Sequences
 from beliefgym.learning.sequences_csv import from_csv, to_csv
 from beliefgym.learning.sequences_minari import from_minari, to_minari
 from beliefgym.learning.sequences_npz import load_npz, save_npz
 from beliefgym.learning.video_frames import read_frames, split_video
-from beliefgym.learning.video_textures import VideoTexture
 from beliefgym.learning.windows import Transitions, Windows
 
 if TYPE_CHECKING:
@@ -26,6 +21,16 @@ if TYPE_CHECKING:
         LaggedError,
         WeightedMultiHorizon,
     )
+    from beliefgym.learning.data_as_demonstrator import DataAsDemonstrator
+    from beliefgym.learning.direct_multi_step import DirectMultiStep
+    from beliefgym.learning.dynamics import DivergenceWarning, DynamicsModel
+    from beliefgym.learning.linear_in_features import Ridge
+    from beliefgym.learning.multi_step_error import MultiStepErrors, multi_step_errors
+    from beliefgym.learning.polynomial import PolynomialRidge
+    from beliefgym.learning.random_forest import RandomForest
+    from beliefgym.learning.random_fourier import RandomFourierRidge
+    from beliefgym.learning.scheduled_sampling import ScheduledSampling
+    from beliefgym.learning.video_textures import VideoTexture
 
 __all__ = [
     "BackpropThroughTime",
@@ -57,13 +62,33 @@ __all__ = [
     "to_minari",
 ]
 
-_NEED_TORCH = ("BackpropThroughTime", "LaggedError", "WeightedMultiHorizon")
+_MODULES = {
+    "BackpropThroughTime": "backprop_through_time",
+    "DataAsDemonstrator": "data_as_demonstrator",
+    "DirectMultiStep": "direct_multi_step",
+    "DivergenceWarning": "dynamics",
+    "DynamicsModel": "dynamics",
+    "LaggedError": "backprop_through_time",
+    "MultiStepErrors": "multi_step_error",
+    "PolynomialRidge": "polynomial",
+    "RandomForest": "random_forest",
+    "RandomFourierRidge": "random_fourier",
+    "Ridge": "linear_in_features",
+    "ScheduledSampling": "scheduled_sampling",
+    "VideoTexture": "video_textures",
+    "WeightedMultiHorizon": "backprop_through_time",
+    "multi_step_errors": "multi_step_error",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """The models that need torch, which takes a second to import, when they are asked for."""
-    if name in _NEED_TORCH:
-        from beliefgym.learning import backprop_through_time
+    """Import the module of a model when its name is first asked for."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = found
+    return found
 
-        return getattr(backprop_through_time, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_MODULES])

@@ -102,3 +102,20 @@ def test_the_readme_names_the_two_commands_and_make_help_lists_them():
     listed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True).stdout
     for target in ("install", "leaderboard", "test", "benchmark"):
         assert re.search(rf"^{target} ", listed, re.M), listed
+
+
+def test_stepping_environments_imports_neither_scikit_learn_nor_torch():
+    code = (
+        "import sys, beliefgym, gymnasium; gymnasium.make('beliefgym/Pendulum-v0').reset(); "
+        "assert not {'sklearn', 'torch'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_name_that_learning_does_not_have_is_told():
+    import beliefgym.learning as learning
+
+    wrong = "Ridgee"
+    with pytest.raises(AttributeError, match=r"module 'beliefgym\.learning' has no attribute 'Ridgee'"):
+        getattr(learning, wrong)
+    assert "LaggedError" in dir(learning)
