@@ -160,6 +160,20 @@ def video_parts(
     return parts, texture, test
 
 
+def video_random_parts(
+    frames: NDArray[np.uint8], seed: int, every: int, n_steps: int, stride: int = 1
+) -> Parts:
+    """Trajectories of principal components of a whole video, split at random as the thesis does it.
+
+    Overlapping trajectories share frames, so that the test part is not new: this measures recall of a video, not
+    prediction of its future. Arguments as of `video_parts`.
+    """
+    texture = VideoTexture(COMPONENTS).fit(frames)
+    trajectories = texture.to_sequences(frames, n_steps=n_steps, stride=stride, every=every)
+    train, validation, test = trajectories.split(SHARES, seed=seed)
+    return train, validation, test
+
+
 def clip_frames(name: str, data: Path) -> NDArray[np.uint8]:
     """The frames of a recorded clip, small and grey."""
     return read_frames(data / CLIPS[name], size=CLIP_SIZE, grey=True)

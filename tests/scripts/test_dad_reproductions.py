@@ -76,25 +76,32 @@ def test_the_data_are_those_of_the_thesis():
     assert distance.max() > 5.0
 
 
-def test_a_test_block_of_a_video_is_seen_by_nothing_else():
+def test_a_test_block_of_a_video_is_seen_by_nothing_else(monkeypatch):
     """Frames carry their number as brightness: every component of a part comes from its own block."""
     frames = np.zeros((120, 4, 5), dtype=np.uint8)
     frames += np.arange(120, dtype=np.uint8)[:, None, None]
     frames[:, 0, 0] = np.random.default_rng(0).integers(0, 255, 120)
     frames += np.random.default_rng(1).integers(0, 9, frames.shape, dtype=np.uint8)
-    before, dad_data.COMPONENTS = dad_data.COMPONENTS, 6
-    try:
-        for fold in range(5):
-            (train, validation, test), texture, shown = dad_data.video_parts(frames, fold, 5, 2, 4)
-            border = np.linspace(0, 120, 7).round().astype(int)
-            np.testing.assert_array_equal(shown, frames[border[fold] : border[fold + 1]])
-            rest = np.concatenate([frames[: border[fold]], frames[border[fold + 2] :]])
-            assert_allclose(texture.mean_, VideoTexture(6).fit(rest).mean_)
-            assert len(test) == len(validation) == 20 - 8
-            n_runs = 1 if fold in (0, 4) else 2
-            assert len(train) == 80 - 8 * n_runs
-    finally:
-        dad_data.COMPONENTS = before
+    monkeypatch.setattr(dad_data, "COMPONENTS", 6)
+    for fold in range(5):
+        (train, validation, test), texture, shown = dad_data.video_parts(frames, fold, 5, 2, 4)
+        border = np.linspace(0, 120, 7).round().astype(int)
+        np.testing.assert_array_equal(shown, frames[border[fold] : border[fold + 1]])
+        rest = np.concatenate([frames[: border[fold]], frames[border[fold + 2] :]])
+        assert_allclose(texture.mean_, VideoTexture(6).fit(rest).mean_)
+        assert len(test) == len(validation) == 20 - 8
+        n_runs = 1 if fold in (0, 4) else 2
+        assert len(train) == 80 - 8 * n_runs
+
+
+def test_a_random_split_of_a_video_keeps_every_window(monkeypatch):
+    monkeypatch.setattr(dad_data, "COMPONENTS", 5)
+    frames = np.random.default_rng(0).integers(0, 255, (100, 4, 5), dtype=np.uint8)
+    train, validation, test = dad_data.video_random_parts(frames, 0, 2, 10)
+    assert [len(part) for part in (train, validation, test)] == [64, 8, 8]  # 80 windows of 21 frames
+    again = dad_data.video_random_parts(frames, 0, 2, 10)[2]
+    assert test.equals(again)
+    assert not test.equals(dad_data.video_random_parts(frames, 1, 2, 10)[2])
 
 
 def test_an_interval_is_students():
