@@ -113,14 +113,20 @@ def horizon_figure(groups: Groups) -> Figure:
     return figure
 
 
-def iterations_figure(groups: Groups) -> Figure:
-    """Multi-step error and aggregate's single-step loss over DaD's iterations, first seed."""
-    n = len(groups)
-    figure = Figure(figsize=(2.6 * n + 0.4, 5.0), layout="constrained")
-    grid = np.atleast_2d(figure.subplots(2, n, squeeze=False))
-    for column, (title, results) in enumerate(groups.items()):
-        history, best = results[0]["dad"]["history"], results[0]["dad"]["best_iteration"]
-        above, below = grid[0, column], grid[1, column]
+def iterations_figure(groups: Groups, columns: int = 5) -> Figure:
+    """Multi-step error and aggregate's single-step loss over DaD's iterations, first seed; runs of one are left out."""
+    histories = {
+        title: results[0]["dad"]
+        for title, results in groups.items()
+        if len(results[0]["dad"]["history"]["iteration"]) > 1 and title.count(", ") < 2
+    }
+    lines = max(1, -(-len(histories) // columns))
+    figure = Figure(figsize=(2.5 * columns + 0.4, 4.4 * lines + 0.4), layout="constrained")
+    grid = figure.subplots(2 * lines, columns, squeeze=False)
+    for place, (title, run) in enumerate(histories.items()):
+        line, column = divmod(place, columns)
+        above, below = grid[2 * line, column], grid[2 * line + 1, column]
+        history, best = run["history"], run["best_iteration"]
         above.plot(history["iteration"], history["train_multi_step"], color=SINGLE, label="training rollouts")
         above.plot(history["iteration"], history["validation_multi_step"], color=DAD, label="validation")
         above.plot(best, history["validation_multi_step"][best], "o", ms=9, mfc="none", mec=DAD)
@@ -129,6 +135,10 @@ def iterations_figure(groups: Groups) -> Figure:
         plain(below, "", "iteration", "loss on the aggregate" if not column else "")
         above.set_yscale("log")
         below.set_yscale("log")
+    for place in range(len(histories), lines * columns):
+        line, column = divmod(place, columns)
+        grid[2 * line, column].set_visible(False)
+        grid[2 * line + 1, column].set_visible(False)
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
