@@ -54,17 +54,23 @@ class Benchmark:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
+    """A row as texts; a row without a rival is a number against its target."""
     meets = {None: "", True: "yes", False: "no"}[row["meets"]]
     target = "" if row["target"] is None else f"{row['target']:g}"
+    rival = row["rival"]
     return [
         row["what"],
-        f"{row['ours']['value']:,.0f}",
+        _number(row["ours"]["value"]),
         row["rival_name"],
-        f"{row['rival']['value']:,.0f}",
-        f"{row['ratio']:.2f}",
+        "" if rival is None else _number(rival["value"]),
+        "" if row["ratio"] is None else f"{row['ratio']:.2f}",
         target,
         meets,
     ]
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100 or value == 0 else f"{value:.3g}"
 
 
 HEADER = ("what", "ours", "rival", "rival's", "ratio", "target", "meets")
@@ -85,11 +91,9 @@ def markdown(record: dict[str, Any]) -> str:
     lines = [f"# {record['command']}", "", f"Machine: {record['machine']}", ""]
     numbers = ("ours", "rival's", "ratio", "target")
     lines += markdown_table(HEADER, [_cells(one) for one in record["rows"]], numbers)
-    lines += [
-        "",
-        "Medians of interleaved repeats; their ranges stand in the JSON file. Limits measured beside:",
-        "",
-    ]
+    if "repeats" not in record["limits"]:
+        lines += ["", "Medians of interleaved repeats; their ranges stand in the JSON file."]
+    lines += ["", "Limits measured beside:", ""]
     lines += [f"- {name}: {_plain(limit)}" for name, limit in record["limits"].items()]
     return "\n".join(lines) + "\n"
 

@@ -199,7 +199,7 @@ def _plain(
     target: float | None,
     *,
     most: bool = False,
-    rival: float = float("nan"),
+    rival: float | None = None,
 ) -> dict[str, Any]:
     """A row that is a number against its target, at most or at least; the ratio is to the rival where there is one."""
     meets = None if target is None else bool(value <= target if most else value >= target)
@@ -207,8 +207,8 @@ def _plain(
         "what": f"{what} (at most)" if most else what,
         "ours": {"value": value, "interval": [value, value]},
         "rival_name": name,
-        "rival": {"value": rival, "interval": [rival, rival]},
-        "ratio": value / rival,
+        "rival": None if rival is None else {"value": rival, "interval": [rival, rival]},
+        "ratio": None if rival is None else value / rival,
         "target": target,
         "meets": meets,
     }
