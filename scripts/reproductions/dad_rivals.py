@@ -124,7 +124,7 @@ def row(problem: str, method: str, results: list[dict[str, Any]]) -> Row:
         "test error": error.text(),
         "against single step": "" if method == "single step" else single.text(),
         "against DaD": "" if method == "DaD" else dad.text(),
-        "CPU seconds": f"{np.median([result[method]['cpu_seconds'] for result in results]):.1f}",
+        "CPU seconds": f"{np.median([result[method]['cpu_seconds'] for result in results]):.2g}",
         "values": single.to_dict(),
         "meets": None,
     }
