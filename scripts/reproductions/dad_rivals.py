@@ -67,6 +67,7 @@ SETTING: dict[str, Any] = {
     "bandwidths": [1.0, 2.0],
     "alphas": [1e-8, 1e-6],
 }
+RATIOS = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 COLUMNS = ("what", "test error", "against single step", "against DaD", "CPU seconds")
 
 
@@ -165,7 +166,9 @@ def rivals_figure(rows: list[Row]) -> Figure:
     problems = list(dict.fromkeys(row["problem"] for row in rows if "values" in row))
     figure = Figure(figsize=(3.0 * max(1, len(problems)) + 2.2, 3.2), layout="constrained")
     for axes, problem in zip(
-        figure.subplots(1, max(1, len(problems)), squeeze=False, sharey=True)[0], problems, strict=False
+        figure.subplots(1, max(1, len(problems)), squeeze=False, sharey=True, sharex=True)[0],
+        problems,
+        strict=False,
     ):
         shown = [row for row in rows if row.get("problem") == problem and row["method"] != "single step"]
         for place, one in enumerate(shown):
@@ -176,6 +179,8 @@ def rivals_figure(rows: list[Row]) -> Figure:
         axes.axvline(1.0, color=FAINT, linestyle="--", linewidth=1)
         axes.set_yticks(range(len(shown)), [one["method"].replace(" (", "\n(") for one in shown])
         axes.set_xscale("log")
+        axes.set_xticks(RATIOS, [f"{ratio:g}" for ratio in RATIOS])
+        axes.minorticks_off()
         plain(axes, problem, "error / single step's", "")
         axes.invert_yaxis()
     return figure
