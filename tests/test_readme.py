@@ -1,4 +1,4 @@
-"""The README's example on recordings does what it says."""
+"""The examples on recordings, of the README and of the guide, do what they say."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,12 @@ from beliefgym.scripts.reproductions.dad_data import pendulum
 README = Path(__file__).parents[1] / "README.md"
 
 
-@pytest.mark.skipif(not README.exists(), reason="the README lies in a checkout only")
+in_checkout = pytest.mark.skipif(
+    not README.exists(), reason="the README and the guides lie in a checkout only"
+)
+
+
+@in_checkout
 def test_five_lines_from_recorded_arrays_to_a_forecast(tmp_path, monkeypatch):
     (example,) = (
         block
@@ -36,3 +41,34 @@ def test_five_lines_from_recorded_arrays_to_a_forecast(tmp_path, monkeypatch):
     assert len(names["plt"].gca().lines) == 6
     names["plt"].savefig("forecast.png")
     names["plt"].close("all")
+
+
+@in_checkout
+def test_the_guide_to_dad_runs(tmp_path, monkeypatch):
+    """Both of its examples, on an arm of one joint with a torque and on a travelling wave."""
+    imageio = pytest.importorskip("imageio.v3")
+    pytest.importorskip("imageio_ffmpeg")
+    csv_example, video_example = re.findall(
+        r"```python\n(.*?)```", (README.parent / "docs" / "data-as-demonstrator.md").read_text(), re.DOTALL
+    )
+    monkeypatch.chdir(tmp_path)
+    rng, rows = np.random.default_rng(0), ["trial,t,joint_angle,joint_speed,torque_1"]
+    for trial in range(20):
+        angle, speed = rng.normal(size=2)
+        for k in range(40):
+            torque = rng.normal()
+            rows.append(f"{trial},{0.1 * k:.3f},{angle},{speed},{torque}")
+            angle, speed = angle + 0.1 * speed, 0.98 * speed + 0.1 * (torque - angle)
+    Path("arm.csv").write_text("\n".join(rows))
+    names: dict = {}
+    exec(csv_example, names)
+    model, test = names["model"], names["test"]
+    assert (model.n_obs_, model.n_act_) == (2, 1)
+    assert model.errors(test).mean < 0.1  # a smooth map of three numbers
+    assert model.history_["validation_multi_step"].shape == (26,)
+
+    t, x, y = np.arange(450)[:, None, None], np.arange(64)[None, None], np.arange(48)[None, :, None]
+    wave = 128 + 100 * np.sin(0.3 * x + 0.2 * y - 0.25 * t)
+    imageio.imwrite("clip.mp4", np.repeat(wave[..., None], 3, axis=3).astype(np.uint8), fps=25)
+    exec(video_example, names)
+    assert names["pictures"].shape == (17, 12, 16)
