@@ -11,6 +11,7 @@ Reference: thesis proposal, Secs. 3.1.1 and 3.2.3.
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Literal, Self
 
@@ -37,7 +38,7 @@ class DivergenceWarning(UserWarning):
     """Predictions left every reasonable range and were cut there."""
 
 
-class DynamicsModel(BaseEstimator):
+class DynamicsModel(BaseEstimator, ABC):
     """Base of the dynamics models: `fit(train, validation)`, `predict`, `rollout`, `errors`.
 
     A subclass has the parameters target, standardise, use_actions and divergence_limit, and implements `fit` and
@@ -53,13 +54,13 @@ class DynamicsModel(BaseEstimator):
     divergence_limit: float
     _fitted_attribute = "model_"  # there once a fit has given something to predict with
 
+    @abstractmethod
     def fit(self, train: Sequences, validation: Sequences | None = None) -> Self:
         """Learn from trajectories; see the subclass."""
-        raise NotImplementedError  # pragma: no cover - each subclass has its own
 
+    @abstractmethod
     def _step(self, z: Array, u: Array) -> Array:
         """Next states: standardised states (n, n_obs) and actions (n, n_act) -> (n, n_obs)."""
-        raise NotImplementedError  # pragma: no cover - each subclass has its own
 
     def predict(self, observations: ArrayLike, actions: ArrayLike | None = None) -> Array:
         """One step: (n, n_obs) and, where the model takes actions, (n, n_act) -> (n, n_obs).

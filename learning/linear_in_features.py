@@ -10,6 +10,7 @@ Reference: thesis proposal, Sec. 3.1.3.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, Self
 
 import numpy as np
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 BLOCK_BYTES = 2**26  # features are made and used in blocks of rows of about this size
 
 
-class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     """Ridge regression on features phi(x); a subclass says which.
 
     A subclass has `alpha` and `fit_intercept` among its parameters, draws or counts its features in
@@ -38,12 +39,13 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator):
     fit_intercept: bool
     _bounded_features = False  # bounded near zero: sums need no shift
 
+    @abstractmethod
     def _prepare(self, n_inputs: int) -> int:
-        raise NotImplementedError  # pragma: no cover - each subclass has its own
+        """Draw or count the features of n_inputs inputs; their number."""
 
+    @abstractmethod
     def features(self, X: Array) -> Array:
         """(n, n_inputs) float64 -> (n, m), C-contiguous; no checks: the inner loop of rollouts."""
-        raise NotImplementedError  # pragma: no cover - each subclass has its own
 
     def fit(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> Self:
         """Fit to these data alone.

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from abc import abstractmethod
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
@@ -153,13 +154,13 @@ class GradientTrained(DynamicsModel):
         self.model_ = chosen
         return self
 
+    @abstractmethod
     def _objective(self, train: Sequences, regressor: LinearInFeatures) -> Objective:
         """What is minimised besides the penalty.
 
         Args:
             train: trajectories. regressor: fitted to their single steps; its features are fixed from here on.
         """
-        raise NotImplementedError  # pragma: no cover - each subclass has its own
 
     def _step(self, z: Array, u: Array) -> Array:
         return self._next(z, self.model_.predict_unchecked(np.concatenate([z, u], axis=1)))
