@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from beliefgym.learning import RandomFourierRidge
+from beliefgym.scripts.leaderboard.plots import INK
 from beliefgym.scripts.reproductions import dad_data as data
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.dad_figures import STYLE, save
@@ -153,6 +154,7 @@ def map_figure(rows: list[Row]) -> Figure:
                 va="center",
                 fontsize=11,
                 fontweight="bold" if sure else "normal",
+                color="white" if abs(values[r, c]) > 50 else INK,
             )
         image = axes.imshow(values, cmap="RdBu", vmin=-80, vmax=80, aspect="auto")
         axes.set_xticks(range(len(sizes)), [str(size) for size in sizes])
