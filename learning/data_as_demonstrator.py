@@ -16,6 +16,7 @@ Venkatraman, Hebert & Bagnell, "Improving multi-step prediction of learned time 
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from typing import Any, Self
 
 import numpy as np
@@ -76,6 +77,9 @@ class DataAsDemonstrator(DynamicsModel):
         standardise: bring the components of states and actions to one scale: True each by its own standard deviation,
             "together" all by one number (components of one unit, such as principal components), False not.
         use_actions: whether actions, where the trajectories have them, are inputs.
+        angles: numbers of the components that are angles in rad; the regressor sees their cosines and sines, and their
+            differences are taken to [-pi, pi), so that it does not matter where a recording starts to count. Only
+            with target "delta".
         divergence_limit: standard deviations of the training data beyond which a rollout is cut.
         progress_bar: show the iterations.
 
@@ -107,6 +111,7 @@ class DataAsDemonstrator(DynamicsModel):
         step_size: float = 0.1,
         standardise: Standardise = True,
         use_actions: bool = True,
+        angles: Collection[int] | None = None,
         divergence_limit: float = 100.0,
         progress_bar: bool = False,
     ) -> None:
@@ -121,6 +126,7 @@ class DataAsDemonstrator(DynamicsModel):
         self.step_size = step_size
         self.standardise = standardise
         self.use_actions = use_actions
+        self.angles = angles
         self.divergence_limit = divergence_limit
         self.progress_bar = progress_bar
 
@@ -148,7 +154,7 @@ class DataAsDemonstrator(DynamicsModel):
         learner = learner_for(
             regressor,
             self.algorithm,
-            np.concatenate([z[episode, t], u[episode, t]], axis=1),
+            self._inputs(z[episode, t], u[episode, t]),
             self._targets(z[episode, t], z[episode, t + 1]),
             self.step_size,
         )
@@ -176,7 +182,7 @@ class DataAsDemonstrator(DynamicsModel):
         return self
 
     def _step(self, z: Array, u: Array) -> Array:
-        output = predict_unchecked(self.model_, np.concatenate([z, u], axis=1), self.n_obs_)
+        output = predict_unchecked(self.model_, self._inputs(z, u), self.n_obs_)
         return self._next(z, output)
 
     def _demonstrate(self, learner: Learner | None, rollouts: Sequences) -> tuple[Array, dict[str, int]]:
@@ -209,7 +215,7 @@ class DataAsDemonstrator(DynamicsModel):
             z_next = np.empty_like(now)
             for start in range(0, len(going), ROWS):
                 block = slice(start, start + ROWS)
-                code = learner.encode(np.concatenate([now[block], action[block]], axis=1))
+                code = learner.encode(self._inputs(now[block], action[block]))
                 z_next[block] = self._next(now[block], learner.predict(code))
                 if kept[block].all():
                     learner.add(code, target[block])
@@ -227,7 +233,7 @@ class DataAsDemonstrator(DynamicsModel):
 
     def _not_outlying(self, predicted: Array, truth: Array) -> NDArray[np.bool_]:
         """(n,) which predictions are near enough to the truth to be corrected."""
-        error = np.sqrt(np.square((predicted - truth) / self._spread).mean(axis=1))
+        error = np.sqrt(np.square(self._difference(predicted, truth) / self._spread).mean(axis=1))
         kept = np.ones(len(error), dtype=np.bool_)
         if self.outlier_threshold is not None:
             kept &= error <= self.outlier_threshold

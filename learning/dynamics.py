@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -42,7 +42,9 @@ class DynamicsModel(BaseEstimator, ABC):
     """Base of the dynamics models: `fit(train, validation)`, `predict`, `rollout`, `errors`.
 
     A subclass has the parameters target, standardise, use_actions and divergence_limit, and implements `fit` and
-    `_step`.
+    `_step`. One that has `angles` too, components in rad that mean the same a turn later, puts its regressor's inputs
+    together with `_inputs`: each angle enters as its cosine and sine, and differences of angles are taken to
+    [-pi, pi).
 
     Attributes:
         n_obs_, n_act_: components of states and actions (0 where actions are not used).
@@ -52,6 +54,7 @@ class DynamicsModel(BaseEstimator, ABC):
     standardise: Standardise
     use_actions: bool
     divergence_limit: float
+    angles: Collection[int] | None = None
     _fitted_attribute = "model_"  # there once a fit has given something to predict with
 
     @abstractmethod
@@ -110,6 +113,20 @@ class DynamicsModel(BaseEstimator, ABC):
         predicted[:, 0] = x
         return predicted[0] if single else predicted
 
+    def flow(self, observations: Array, actions: Array) -> Array:
+        """`predict` for any leading shape and without checks, for planners: what diverges comes back as NaN.
+
+        Args:
+            observations: (..., n_obs). actions: (..., n_act).
+
+        Returns:
+            (..., n_obs).
+        """
+        leading = observations.shape[:-1]
+        z = self._observed.apply(observations.reshape(-1, self.n_obs_))
+        u = self._acted.apply(actions.reshape(-1, actions.shape[-1])[:, : self.n_act_])
+        return self._observed.invert(self._step(z, u)).reshape(*leading, self.n_obs_)
+
     def errors(self, sequences: Sequences) -> MultiStepErrors:
         """Multi-step errors: each trajectory predicted from its first observation, with its own actions.
 
@@ -129,8 +146,8 @@ class DynamicsModel(BaseEstimator, ABC):
         z, u = self._coordinates(sequences)
         episode, time = np.nonzero(sequences.step_mask)
         predicted = self._observed.invert(self._step(z[episode, time], u[episode, time]))
-        error = np.square(predicted - sequences.observations[episode, time + 1]).sum(axis=1)
-        return float(np.sqrt(error.mean()))
+        error = self._difference(predicted, sequences.observations[episode, time + 1])
+        return float(np.sqrt(np.square(error).sum(axis=1).mean()))
 
     def _begin(self, train: Sequences, validation: Sequences | None = None) -> None:
         """Check the data and take the coordinates from those to train on."""
@@ -157,7 +174,11 @@ class DynamicsModel(BaseEstimator, ABC):
             raise ValueError(
                 f"expected standardise to be one of {list(STANDARDISATIONS)}, got {self.standardise!r}"
             )
+        self._turns = self._checked_angles()
         self._observed, self._acted = scaled(rows), scaled(steps)
+        self._observed.offset[self._turns] = 0.0
+        self._observed.scale[self._turns] = 1.0
+        spread.scale[self._turns] = np.maximum(spread.scale[self._turns], np.pi)
         for what, names, constant in (
             ("observations", train.observation_names, spread.constant),
             ("actions", train.action_names, Standardisation.of(steps).constant),
@@ -171,7 +192,7 @@ class DynamicsModel(BaseEstimator, ABC):
         self._centre, self._spread = self._observed.apply(spread.offset), spread.scale / self._observed.scale
         episode, time = np.nonzero(train.step_mask)
         z = self._observed.apply(train.observations)
-        change = z[episode, time + 1] - z[episode, time]
+        change = self._difference(z[episode, time + 1], z[episode, time])
         scaled = Standardisation.together if self.standardise == "together" else Standardisation.of
         self._change_scale = scaled(change).scale if self.target == "delta" else np.ones(self.n_obs_)
 
@@ -190,11 +211,43 @@ class DynamicsModel(BaseEstimator, ABC):
 
     def _targets(self, z: Array, z_next: Array) -> Array:
         """What the regressor is to give at state z so that the next state is z_next; (n, n_obs)."""
-        return (z_next - z) / self._change_scale if self.target == "delta" else z_next
+        return self._difference(z_next, z) / self._change_scale if self.target == "delta" else z_next
 
     def _next(self, z: Array, output: Array) -> Array:
         """The next state from the regressor's output at state z; (n, n_obs)."""
         return z + output * self._change_scale if self.target == "delta" else output
+
+    def _inputs(self, z: Array, u: Array) -> Array:
+        """What a regressor is given: (n, n_obs) and (n, n_act) -> (n, n_obs + number of angles + n_act).
+
+        Angles give way to their cosines, in place, and their sines stand after the states.
+        """
+        if not len(self._turns):
+            return np.concatenate([z, u], axis=1)
+        turned = z[:, self._turns]
+        inputs = np.concatenate([z, np.sin(turned), u], axis=1)
+        inputs[:, self._turns] = np.cos(turned)
+        return inputs
+
+    def _difference(self, a: Array, b: Array) -> Array:
+        """a - b with the differences of angles in [-pi, pi); (..., n_obs)."""
+        difference = a - b
+        if len(self._turns):
+            turned = difference[..., self._turns]
+            difference[..., self._turns] = turned - 2.0 * np.pi * np.floor(turned / (2.0 * np.pi) + 0.5)
+        return difference
+
+    def _checked_angles(self) -> NDArray[np.int64]:
+        """(k,) the numbers of the components that are angles."""
+        angles = [] if self.angles is None else sorted(self.angles)
+        for angle in angles:
+            if isinstance(angle, bool) or not isinstance(angle, int | np.integer) or not 0 <= angle < self.n_obs_:
+                raise ValueError(
+                    f"expected angles as numbers of components, 0 to {self.n_obs_ - 1}, got {angle!r}"
+                )
+        if angles and self.target != "delta":
+            raise ValueError("expected target='delta' with angles: a difference of angles has no jump, an angle has")
+        return np.array(angles, dtype=np.int64)
 
     def _inside(self, z: Array) -> NDArray[np.bool_]:
         """(n,) which states are finite and within the divergence limit."""
@@ -226,9 +279,11 @@ class DynamicsModel(BaseEstimator, ABC):
         return predicted, cut
 
     def _errors(self, predicted: Array, sequences: Sequences, n_diverged: int) -> MultiStepErrors:
-        return multi_step_errors(
-            self._observed.invert(predicted), sequences.observations, sequences.lengths, n_diverged
-        )
+        truth = sequences.observations
+        states = self._observed.invert(predicted)
+        if len(self._turns):
+            states = truth + self._difference(states, truth)
+        return multi_step_errors(states, truth, sequences.lengths, n_diverged)
 
     def _actions_of(self, actions: ArrayLike | None, shape: tuple[int, ...]) -> Array:
         """Standardised actions of the shape (*shape, n_act)."""

@@ -47,6 +47,18 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def features(self, X: Array) -> Array:
         """(n, n_inputs) float64 -> (n, m), C-contiguous; no checks: the inner loop of rollouts."""
 
+    @abstractmethod
+    def feature_jacobian(self, X: Array, weights: Array) -> Array:
+        """d (weights' phi) / d x at each row: (n, n_inputs) and (m, d) -> (n, d, n_inputs); no checks."""
+
+    def jacobian(self, X: Array) -> Array:
+        """The derivative of the prediction by the inputs: (n, n_inputs) -> (n, d, n_inputs); no checks."""
+        rows = self._rows_a_block()
+        if len(X) <= rows:
+            return self.feature_jacobian(X, self._weights)
+        blocks = [self.feature_jacobian(X[i : i + rows], self._weights) for i in range(0, len(X), rows)]
+        return np.concatenate(blocks)
+
     def fit(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> Self:
         """Fit to these data alone.
 
@@ -195,3 +207,7 @@ class Ridge(LinearInFeatures):
     def features(self, X: Array) -> Array:
         """The inputs themselves."""
         return X
+
+    def feature_jacobian(self, X: Array, weights: Array) -> Array:
+        """A' at every row."""
+        return np.broadcast_to(weights.T, (len(X), *weights.T.shape))

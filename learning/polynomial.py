@@ -58,6 +58,21 @@ class PolynomialRidge(LinearInFeatures):
                 np.multiply(columns[lower], inputs[variable], out=columns[i])
         return np.ascontiguousarray(columns.T)
 
+    def feature_jacobian(self, X: Array, weights: Array) -> Array:
+        """sum_a A_a a_j x^(a - e_j), by the product rule along the chain of monomials."""
+        n, k = X.shape
+        inputs = np.ascontiguousarray(X.T)
+        columns = np.ascontiguousarray(self.features(X).T)
+        slopes = np.zeros((len(self._factors), k, n))  # d monomial / d x_j
+        for i, (lower, variable) in enumerate(self._factors):
+            if lower is None:
+                slopes[i, variable] = 1.0
+            else:
+                np.multiply(slopes[lower], inputs[variable], out=slopes[i])
+                slopes[i, variable] += columns[lower]
+        by_output = weights.T @ slopes.reshape(len(slopes), k * n)
+        return np.ascontiguousarray(by_output.reshape(-1, k, n).transpose(2, 0, 1))
+
     def _check_parameters(self) -> None:
         super()._check_parameters()
         if not (isinstance(self.degree, int | np.integer) and self.degree >= 1):

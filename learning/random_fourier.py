@@ -75,6 +75,18 @@ class RandomFourierRidge(LinearInFeatures):
         cosine_and_sine(X @ self.frequencies_, phi[:, start : start + m], phi[:, start + m :], m**-0.5)
         return phi
 
+    def feature_jacobian(self, X: Array, weights: Array) -> Array:
+        """sum_i (A_sin,i cos(w_i'x) - A_cos,i sin(w_i'x)) w_i' / sqrt(m), and A_inputs' where inputs are features."""
+        m, start = self.n_frequencies, X.shape[1] if self.include_inputs else 0
+        n, d = len(X), weights.shape[1]
+        cosine, sine = np.empty((n, m)), np.empty((n, m))
+        cosine_and_sine(X @ self.frequencies_, cosine, sine, m**-0.5)
+        of_cosine, of_sine = weights[start : start + m].T, weights[start + m :].T
+        slopes = cosine[:, None] * of_sine  # (n, d, m)
+        slopes -= sine[:, None] * of_cosine
+        jacobian = (slopes.reshape(n * d, m) @ self.frequencies_.T).reshape(n, d, X.shape[1])
+        return jacobian + weights[:start].T if start else jacobian
+
     def _check_parameters(self) -> None:
         super()._check_parameters()
         if not (isinstance(self.n_frequencies, int | np.integer) and self.n_frequencies >= 1):
