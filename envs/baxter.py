@@ -85,6 +85,7 @@ class BaxterReach(BaxterArm):
     target: Seven = NEUTRAL
 
     state_names: ClassVar = tuple(f"{joint}_{part}" for part in ("angle", "velocity") for joint in JOINTS)
+    rates: ClassVar = {f"{joint}_angle": f"{joint}_velocity" for joint in JOINTS}
     observation_names: ClassVar = state_names
 
     def __post_init__(self) -> None:

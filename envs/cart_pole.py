@@ -64,6 +64,7 @@ class CartPole(System):
     start_spread: float = 0.1
 
     state_names: ClassVar = ("x", "velocity", "theta", "angular_velocity")
+    rates: ClassVar = {"x": "velocity", "theta": "angular_velocity"}
     action_names: ClassVar = ("force",)
     observation_names: ClassVar = ("x", "cos_theta", "sin_theta", "velocity", "angular_velocity")
 

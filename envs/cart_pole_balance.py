@@ -71,6 +71,7 @@ class CartPoleBalance(System):
     start_spread: float = 0.05
 
     state_names: ClassVar = ("x", "velocity", "theta", "angular_velocity")
+    rates: ClassVar = {"x": "velocity", "theta": "angular_velocity"}
     action_names: ClassVar = ("force",)
     observation_names: ClassVar = ("x", "velocity", "theta", "angular_velocity")
 

@@ -97,6 +97,7 @@ class DoublePendulum(System):
     substeps: int = 3
 
     state_names: ClassVar = ("theta_1", "angular_velocity_1", "theta_2", "angular_velocity_2")
+    rates: ClassVar = {"theta_1": "angular_velocity_1", "theta_2": "angular_velocity_2"}
     action_names: ClassVar = ("drive",)
     observation_names: ClassVar = (
         "cos_theta_1",

@@ -64,6 +64,7 @@ class Pendulum(System):
     start_speed: float = 1.0
 
     state_names: ClassVar = ("theta", "angular_velocity")
+    rates: ClassVar = {"theta": "angular_velocity"}
     action_names: ClassVar = ("torque",)
     observation_names: ClassVar = ("cos_theta", "sin_theta", "angular_velocity")
 

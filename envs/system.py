@@ -15,6 +15,7 @@ with one subclass, and one call in catalogue.py.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -54,6 +55,9 @@ class System(ABC):
     observation_names: ClassVar[tuple[str, ...]]
     disturbance_names: ClassVar[tuple[str, ...]] = ()
     hint_names: ClassVar[tuple[str, ...] | None] = None  # None: the hint is the whole state
+    rates: ClassVar[
+        Mapping[str, str]
+    ] = {}  # position -> velocity, by name: what a filter of positions estimates
     quaternions: ClassVar[tuple[int, ...]] = ()  # where in the state a unit quaternion begins
 
     def __post_init__(self) -> None:

@@ -241,12 +241,18 @@ class DynamicsModel(BaseEstimator, ABC):
         """(k,) the numbers of the components that are angles."""
         angles = [] if self.angles is None else sorted(self.angles)
         for angle in angles:
-            if isinstance(angle, bool) or not isinstance(angle, int | np.integer) or not 0 <= angle < self.n_obs_:
+            if (
+                isinstance(angle, bool)
+                or not isinstance(angle, int | np.integer)
+                or not 0 <= angle < self.n_obs_
+            ):
                 raise ValueError(
                     f"expected angles as numbers of components, 0 to {self.n_obs_ - 1}, got {angle!r}"
                 )
         if angles and self.target != "delta":
-            raise ValueError("expected target='delta' with angles: a difference of angles has no jump, an angle has")
+            raise ValueError(
+                "expected target='delta' with angles: a difference of angles has no jump, an angle has"
+            )
         return np.array(angles, dtype=np.int64)
 
     def _inside(self, z: Array) -> NDArray[np.bool_]:

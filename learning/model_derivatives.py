@@ -82,4 +82,6 @@ def _central_differences(model: DynamicsModel, z: Array, v: Array, step: float) 
 
 
 def _step(regressor: Any) -> float:
-    return TREE_STEP if hasattr(regressor, "estimators_") or hasattr(regressor, "for_aggregate") else SMOOTH_STEP
+    return (
+        TREE_STEP if hasattr(regressor, "estimators_") or hasattr(regressor, "for_aggregate") else SMOOTH_STEP
+    )

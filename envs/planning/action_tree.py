@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefgym.envs.system import System
+from beliefgym.envs.planning.learned_model import PlanningModel
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class TreePlans:
 
 
 def tree_search(
-    system: System,
+    system: PlanningModel,
     state: Floats,
     *,
     hold: int,
@@ -91,7 +91,7 @@ def tree_search(
 
 
 def _rank(
-    system: System,
+    system: PlanningModel,
     state: Floats,
     levels: Floats,
     hold: int,

@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.envs.planning.box_qp import box_qp, solve_free
+from beliefgym.envs.planning.learned_model import PlanningModel
 from beliefgym.envs.planning.linearisation import expand_cost, linearise
-from beliefgym.envs.system import System
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class ILQR:
     """The planner; see the module for what it minimises and how.
 
     Args:
-        system: a `System`; its noise is left out of the plan.
+        system: a `System`, whose noise is left out of the plan, or a `LearnedModel`.
         horizon: T, in steps.
         stage_cost: (state (..., n), action (..., m)) -> (...), for numpy and torch; `system.stage_cost` if None.
         terminal_cost: (state (..., n)) -> (...), for numpy and torch; none if None.
@@ -76,7 +76,7 @@ class ILQR:
         ValueError: a horizon, max_iterations or tolerance that is not positive.
     """
 
-    system: System
+    system: PlanningModel
     horizon: int
     stage_cost: Callable[[Any, Any], Any] | None = None
     terminal_cost: Callable[[Any], Any] | None = None
@@ -94,6 +94,7 @@ class ILQR:
         initial_actions: ArrayLike | None = None,
         initial_gains: ArrayLike | None = None,
         initial_states: ArrayLike | None = None,
+        allow_divergence: bool = False,
     ) -> ILQRSolution:
         """Plan from each initial state; a problem does not depend on the others of the batch.
 
@@ -103,6 +104,8 @@ class ILQR:
             initial_gains: (b, T, m, n), feedback about initial_states that the first roll-out uses: a plan that
                 was made for a nearby initial state, as a warm start.
             initial_states: (b, T + 1, n) or (b, T, n); needed with initial_gains.
+            allow_divergence: leave a problem whose first roll-out diverges as it is, with infinite cost, instead of
+                raising; the others go on.
 
         Returns:
             the plans.
@@ -113,7 +116,7 @@ class ILQR:
         start, actions, gains, reference = self._check(
             initial_state, initial_actions, initial_gains, initial_states
         )
-        search = _Search(self, start, actions, gains, reference)
+        search = _Search(self, start, actions, gains, reference, allow_divergence)
         for _ in range(self.max_iterations):
             if not search.improve():
                 break
@@ -167,7 +170,13 @@ class _Search:
     """The state of one solve; arrays are time-major. Rows that are finished are left out of the work."""
 
     def __init__(
-        self, problem: ILQR, start: Floats, actions: Floats, gains: Floats | None, reference: Floats | None
+        self,
+        problem: ILQR,
+        start: Floats,
+        actions: Floats,
+        gains: Floats | None,
+        reference: Floats | None,
+        allow_divergence: bool,
     ) -> None:
         self.problem = problem
         self.low, self.high = problem.system.action_limits
@@ -177,7 +186,7 @@ class _Search:
         states, self.actions = self._roll_out(start[None], actions[:, None], gains, reference)
         self.states, self.actions = states[:, 0], self.actions[:, 0]
         self.cost = self._cost(self.states, self.actions)
-        if not np.isfinite(self.cost).all():
+        if not (allow_divergence or np.isfinite(self.cost).all()):
             row = int(np.flatnonzero(~np.isfinite(self.cost))[0])
             raise ValueError(
                 f"the first roll-out of problem {row} diverges (a state beyond {HUGE:g}); pass initial_actions "
@@ -185,7 +194,7 @@ class _Search:
             )
         self.gains = np.zeros((horizon, b, m, n))
         self.mu = np.zeros(b)
-        self.active = np.arange(b)
+        self.active = np.flatnonzero(np.isfinite(self.cost))
         self.stale = np.ones(b, dtype=bool)  # whose derivatives belong to an older trajectory
         self.converged = np.zeros(b, dtype=bool)
         self.iterations = np.zeros(b, dtype=np.int64)
@@ -196,7 +205,7 @@ class _Search:
 
     def solution(self) -> ILQRSolution:
         """The plans, with undamped gains about their last trajectories."""
-        rows = np.flatnonzero(~self.converged | (self.mu > 0.0))
+        rows = np.flatnonzero((~self.converged | (self.mu > 0.0)) & np.isfinite(self.cost))
         if len(rows):
             self.active = rows
             self.mu[rows] = 0.0
@@ -217,6 +226,8 @@ class _Search:
 
     def improve(self) -> bool:
         """One iteration of every unfinished problem; False when none is left."""
+        if not len(self.active):
+            return False
         self._differentiate()
         rows = self.active
         steps, gains, expected = self._backward(rows)

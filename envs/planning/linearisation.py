@@ -19,16 +19,16 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from beliefgym.envs.system import System
+from beliefgym.envs.planning.learned_model import PlanningModel
 
 Floats = NDArray[np.float64]
 
 
-def linearise(system: System, state: ArrayLike, action: ArrayLike) -> tuple[Floats, Floats]:
+def linearise(system: PlanningModel, state: ArrayLike, action: ArrayLike) -> tuple[Floats, Floats]:
     """The Jacobians of `system.flow`, which is a step without noise and inside the action limits.
 
     Args:
-        system: its `flow` runs on torch through the array API.
+        system: a `System` or another model; it gives its own `derivatives`, or its `flow` runs on torch.
         state: (..., n).
         action: (..., m), same leading shape.
 
@@ -41,6 +41,11 @@ def linearise(system: System, state: ArrayLike, action: ArrayLike) -> tuple[Floa
     s, u = _rows(system, state, action)
     n, m = s.shape[-1], u.shape[-1]
     leading = s.shape[:-1]
+    own = getattr(system, "derivatives", None)
+    if own is not None:
+        a, b = own(s, u)
+        _check_finite(np.concatenate([a, b], axis=-1), leading, f"the Jacobian of {type(system).__name__}")
+        return a, b
 
     z = torch.as_tensor(np.concatenate([s, u], axis=-1).reshape(-1, n + m)).requires_grad_()
     with torch.enable_grad():
@@ -117,7 +122,7 @@ def _derivatives(outputs: torch.Tensor, inputs: torch.Tensor) -> Floats:
     return np.ascontiguousarray(torch.stack(gradients, dim=1).numpy())
 
 
-def _rows(system: System, state: ArrayLike, action: ArrayLike) -> tuple[Floats, Floats]:
+def _rows(system: PlanningModel, state: ArrayLike, action: ArrayLike) -> tuple[Floats, Floats]:
     s, u = np.asarray(state, dtype=np.float64), np.asarray(action, dtype=np.float64)
     n, m = system.n_state, system.n_action
     if s.ndim < 1 or u.ndim < 1 or s.shape[-1] != n or u.shape[-1] != m or s.shape[:-1] != u.shape[:-1]:
