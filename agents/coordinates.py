@@ -46,7 +46,7 @@ class Coordinates:
         shown = tuple(observation_names)
         names: list[str] = []
         angles: list[int] = []
-        attitude = None
+        attitude: tuple[float, ...] | None = None
         for name in shown:
             angle = name[4:]
             if name.startswith("cos_") and f"sin_{angle}" in shown:

@@ -32,8 +32,8 @@ from tqdm import tqdm
 from beliefgym.agents.agent import Agent, episode_starts, require_box
 from beliefgym.agents.coordinates import Coordinates
 from beliefgym.agents.delay_state import DelayState
-from beliefgym.agents.exploration import Exploration, Explorer
 from beliefgym.agents.expert import Expert
+from beliefgym.agents.exploration import Exploration, Explorer
 from beliefgym.agents.policy_synthesis import ModelPolicy, RecedingHorizonSynthesis, Synthesis
 from beliefgym.agents.training_callback import TrainingCallback
 from beliefgym.envs.collect import collect
@@ -86,6 +86,7 @@ class SystemIdentification(Agent):
         models: one mapping an iteration: "n_transitions", "trials", "interaction_steps", "interaction_seconds",
             "fit_seconds", "policy_seconds", "single_step_error", "multi_step_error" (on the data), "cost" (mean of the
             policy's trials; None before they were run), "told" (warnings).
+        trials: every trial as `Sequences` of one episode: observations as the environment showed them.
         num_timesteps: interaction steps so far.
 
     Raises:
@@ -158,7 +159,7 @@ class SystemIdentification(Agent):
         self.history: list[dict[str, Any]] = []
         self.models: list[dict[str, Any]] = []
         self.num_timesteps = 0
-        self._trials: list[Sequences] = []
+        self.trials: list[Sequences] = []
         self._policies: list[ModelPolicy] = []
         self._fitted: list[DynamicsModel] = []
 
@@ -205,24 +206,24 @@ class SystemIdentification(Agent):
 
     def fit_policy(self) -> Self:
         """Fit a model to all data and make its policy, if there are data newer than the last one's."""
-        if self._trials and (not self.models or self.models[-1]["trials"] < len(self._trials)):
+        if self.trials and (not self.models or self.models[-1]["trials"] < len(self.trials)):
             self._make_policy()
         return self
 
     def _due_for_model(self) -> bool:
         """Whether the next thing to do is a model."""
-        if len(self._trials) < max(1, self.initial_trials):
+        if len(self.trials) < max(1, self.initial_trials):
             return False
         per_iteration = self.policy_trials + self.exploration_trials
-        return (len(self._trials) - max(1, self.initial_trials)) // per_iteration >= len(self.models)
+        return (len(self.trials) - max(1, self.initial_trials)) // per_iteration >= len(self.models)
 
     def _next_trial(self, told: TrainingCallback) -> bool:
         """One trial of the schedule, with the model before it where one is due; False to stop."""
         if self._due_for_model():
             self._make_policy()
         first = max(1, self.initial_trials)
-        place = (len(self._trials) - first) % (self.policy_trials + self.exploration_trials)
-        explores = len(self._trials) < first or place >= self.policy_trials
+        place = (len(self.trials) - first) % (self.policy_trials + self.exploration_trials)
+        explores = len(self.trials) < first or place >= self.policy_trials
         self._run_trial("exploration" if explores else "policy")
         if not explores or place + 1 == self.policy_trials + self.exploration_trials:
             self._account()
@@ -230,7 +231,7 @@ class SystemIdentification(Agent):
 
     def _run_trial(self, kind: str) -> None:
         """Run the real system once, and keep the trial."""
-        number = len(self._trials)
+        number = len(self.trials)
         env = self.task.make()
         if kind == "policy":
             policy: Any = _Acting(self, self._policies[-1])
@@ -245,7 +246,7 @@ class SystemIdentification(Agent):
         )
         env.close()
         steps = int(trial.lengths[0])
-        self._trials.append(trial)
+        self.trials.append(trial)
         self.num_timesteps += steps
         self.history.append(
             {
@@ -310,7 +311,7 @@ class SystemIdentification(Agent):
         self._policies.append(policy)
         self.models.append(
             {
-                "trials": len(self._trials),
+                "trials": len(self.trials),
                 "n_transitions": data.n_transitions,
                 "interaction_steps": self.num_timesteps,
                 "interaction_seconds": self.num_timesteps * self.dt,
@@ -328,7 +329,8 @@ class SystemIdentification(Agent):
     def _synthesise(self, learned: LearnedModel) -> ModelPolicy:
         """The policy of a model; the one before, or doing nothing, where the model gives none."""
         try:
-            return self.synthesis.policy(learned, *self.target, self._angles())
+            state, action = self.target
+            return self.synthesis.policy(learned, state, action, self._angles())
         except (ValueError, np.linalg.LinAlgError) as error:
             before = bool(self._policies)
             warnings.warn(
@@ -349,11 +351,11 @@ class SystemIdentification(Agent):
         Raises:
             ValueError: there are none.
         """
-        if not self._trials:
+        if not self.trials:
             raise ValueError("expected trials to learn from, got none; call learn(total_timesteps) first")
         episodes = []
         skipped = 0 if self.filter is not None else self._source.n_delays - 1
-        for trial in self._trials:
+        for trial in self.trials:
             steps = int(trial.lengths[0])
             if steps <= skipped:
                 continue  # too short to hold a state
@@ -365,7 +367,7 @@ class SystemIdentification(Agent):
             )
         if not episodes:
             raise ValueError(
-                f"expected a trial of more than {skipped} steps to learn from, got {len(self._trials)} shorter ones; "
+                f"expected a trial of more than {skipped} steps to learn from, got {len(self.trials)} shorter ones; "
                 "take fewer delays, or start where the episode does not end at once"
             )
         return Sequences.from_episodes(episodes)
@@ -462,7 +464,7 @@ class SystemIdentification(Agent):
         """The trials, the records and the model's settings: the policies are fitted anew from them on loading."""
         from beliefgym.agents.saved_trials import pack
 
-        return pack(self._trials, self.history, self.models)
+        return pack(self.trials, self.history, self.models)
 
     def restore(self, parts: Mapping[str, bytes]) -> None:
         """The reverse of `parts`."""
@@ -474,9 +476,9 @@ class SystemIdentification(Agent):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             for one in models:
-                self._trials = trials[: one["trials"]]
+                self.trials = trials[: one["trials"]]
                 self._make_policy()
-        self._trials, self.models = trials, models
+        self.trials, self.models = trials, models
 
     # ------------------------------------------------------------------------------------------------------- settings
 

@@ -42,6 +42,9 @@ class PlanningModel(Protocol):
     def stage_cost(self, state: Any, action: Any) -> Any:
         """(..., n), (..., m) -> (...)."""
 
+    def clip(self, action: Any) -> Any:
+        """The action within its limits."""
+
 
 @dataclass(frozen=True, eq=False)
 class LearnedModel:
