@@ -16,7 +16,6 @@ import numpy as np
 from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
-from beliefgym.envs.planning.learned_model import Cost
 from beliefgym.envs.quaternions import conjugate, product
 from beliefgym.envs.system import System
 
@@ -98,7 +97,7 @@ class Coordinates:
                 found.append(column[name])
         return np.stack(found, axis=-1)
 
-    def cost_of(self, system: System, derived: Mapping[str, str] | None = None) -> Cost:
+    def cost_of(self, system: System, derived: Mapping[str, str] | None = None) -> StateCost:
         """The system's stage cost, of coordinates.
 
         Args:
@@ -139,6 +138,10 @@ class StateCost:
 
     def __call__(self, x: Any, u: Any) -> Any:
         """(..., d), (..., m) -> (...)."""
+        return self.stage_cost(self.state(x), u)
+
+    def state(self, x: Any) -> Any:
+        """The system's state at coordinates: (..., d) -> (..., n)."""
         xp = array_namespace(x)
         attitude: dict[str, Any] = {}
         if self.coordinates.target_attitude is not None:
@@ -152,4 +155,4 @@ class StateCost:
             attitude[name] if column is None else x[..., column]
             for name, column in zip(self.state_names, self.columns, strict=True)
         ]
-        return self.stage_cost(xp.stack(parts, axis=-1), u)
+        return xp.stack(parts, axis=-1)

@@ -17,6 +17,7 @@ from beliefgym.scripts.training import machine
 BENCHMARKS = {
     "env": "beliefgym.scripts.benchmarks.env:run",
     "dad": "beliefgym.scripts.benchmarks.dad:run",
+    "control": "beliefgym.scripts.benchmarks.control:run",
 }
 
 
@@ -30,7 +31,7 @@ class Benchmark:
     """
 
     name: tyro.conf.Positional[str]
-    """Which: env, dad."""
+    """Which: env, dad, control."""
     results: Path = Path("results")
     """Folder; NAME.json and NAME.md are written to its benchmark/."""
 

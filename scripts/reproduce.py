@@ -21,6 +21,11 @@ REPRODUCTIONS = {
     "dad-growth": "beliefgym.scripts.reproductions.dad_growth:run",
     "dad-rivals": "beliefgym.scripts.reproductions.dad_rivals:run",
     "dad-video": "beliefgym.scripts.reproductions.dad_video:run",
+    "control-cart-pole": "beliefgym.scripts.reproductions.control_cart_pole:run",
+    "control-swing-up": "beliefgym.scripts.reproductions.control_trials:run",
+    "control-helicopter": "beliefgym.scripts.reproductions.control_helicopter:run",
+    "control-base": "beliefgym.scripts.reproductions.control_base:run",
+    "control-arm": "beliefgym.scripts.reproductions.control_arm:run",
 }
 
 

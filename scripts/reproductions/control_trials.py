@@ -1,7 +1,7 @@
 """`beliefgym reproduce control-swing-up`: in how many trials DaD+Control solves the cart-pole swing-up.
 
-One exploration trial with uniformly random forces, then policy trials of 3 s at 20 Hz, each followed by a new model (250
-random Fourier features and the inputs themselves) and a new policy (iLQR over 2 s, planned anew at every step). After
+One exploration trial with uniformly random forces, then policy trials of 3 s at 20 Hz, each followed by a new model
+(250 random Fourier features and the inputs themselves) and a new policy (iLQR over 2 s, planned anew at every step). After
 k policy trials the policy made of all k + 1 trials counts as a solution if at least 95 of 100 fresh trials are upright
 for their whole last second (see `control_swing_up`). To save time it is tested where it was upright for the last second
 of its own next trial as well, which can only raise the count.
