@@ -1,8 +1,15 @@
 """What acts: experts, baselines and learned agents, all in Stable-Baselines3's face."""
 
 from beliefgym.agents.agent import Agent
+from beliefgym.agents.dad_control import DaDControl
 from beliefgym.agents.evaluation import Evaluation, evaluate
 from beliefgym.agents.expert import Expert
+from beliefgym.agents.exploration import Exploration
+from beliefgym.agents.policy_synthesis import (
+    OpenLoopSynthesis,
+    RecedingHorizonSynthesis,
+    RegulatorSynthesis,
+)
 from beliefgym.agents.random_agent import RandomAgent
 from beliefgym.agents.registry import (
     AgentSpec,
@@ -13,14 +20,21 @@ from beliefgym.agents.registry import (
     register_agent,
 )
 from beliefgym.agents.sb3_agent import SB3Agent
+from beliefgym.agents.system_identification import SystemIdentification
 
 __all__ = [
     "Agent",
     "AgentSpec",
+    "DaDControl",
     "Evaluation",
     "Expert",
+    "Exploration",
+    "OpenLoopSynthesis",
     "RandomAgent",
+    "RecedingHorizonSynthesis",
+    "RegulatorSynthesis",
     "SB3Agent",
+    "SystemIdentification",
     "agent_specs",
     "evaluate",
     "find_agent",

@@ -28,6 +28,9 @@ class Exploration:
             range ("random", "epsilon"), and for no noise ("expert").
         epsilon: probability that an action is disturbed; only "epsilon".
         hold: steps for which a random action or disturbance is held.
+        restoring: share of the sum of all disturbances so far that each action takes back. Where an action is the
+            change of a control, the control is a random walk with 0; with 1 it is white noise about where it began,
+            with 1 - rho it is autoregressive with the coefficient rho.
 
     Raises:
         ValueError: an unknown kind, or numbers out of range.
@@ -37,6 +40,7 @@ class Exploration:
     std: float | tuple[float, ...] | None = None
     epsilon: float = 0.2
     hold: int = 1
+    restoring: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kind not in ("random", "expert", "epsilon"):
@@ -49,6 +53,8 @@ class Exploration:
             raise ValueError(f"expected epsilon within 0..1, got {self.epsilon!r}")
         if isinstance(self.hold, bool) or not isinstance(self.hold, int) or self.hold < 1:
             raise ValueError(f"expected hold to be a whole number of at least 1, got {self.hold!r}")
+        if not 0.0 <= self.restoring <= 1.0:
+            raise ValueError(f"expected restoring within 0..1, got {self.restoring!r}")
 
 
 class Explorer:
@@ -68,6 +74,7 @@ class Explorer:
         self._low, self._high = np.asarray(space.low, float), np.asarray(space.high, float)
         self._disturbance = np.zeros((0, *space.shape))
         self._disturbed = np.zeros(0, dtype=np.bool_)
+        self._sum = np.zeros((0, *space.shape))
         self._clock = 0
 
     def predict(
@@ -82,14 +89,29 @@ class Explorer:
         if n != len(self._disturbance) or self._clock % self._how.hold == 0:
             self._draw(n)
         self._clock += 1
+        disturbance = self._disturbance
+        if self._how.restoring:
+            disturbance = self._restored(disturbance, episode_start)
         if self._base is None:
-            return np.clip(self._disturbance, self._low, self._high), True
+            middle = 0.5 * (self._high + self._low)
+            return np.clip(middle + disturbance, self._low, self._high), True
         action, state = self._base.predict(
             observation, state=state, episode_start=episode_start, deterministic=True
         )
-        disturbed = np.asarray(action, dtype=float) + self._disturbance
+        disturbed = np.asarray(action, dtype=float) + disturbance
         action = np.where(self._disturbed[:, None], disturbed, action)
         return np.clip(action, self._low, self._high), state
+
+    def _restored(self, disturbance: Floats, episode_start: Any) -> Floats:
+        """Disturbances that take back their share of the sum so far, within half the range."""
+        if len(disturbance) != len(self._sum):
+            self._sum = np.zeros_like(disturbance)
+        elif episode_start is not None:
+            self._sum[np.asarray(episode_start, dtype=np.bool_)] = 0.0
+        half = 0.5 * (self._high - self._low)
+        restored = np.clip(disturbance - self._how.restoring * self._sum, -half, half)
+        self._sum = self._sum + np.where(self._disturbed[:, None], restored, 0.0)
+        return restored
 
     def _draw(self, n: int) -> None:
         """Disturbances for the next `hold` steps, and whom they meet."""
@@ -101,8 +123,6 @@ class Explorer:
             self._disturbance = np.zeros(shape)
         else:
             self._disturbance = self._rng.uniform(-half, half, shape)
-        if self._base is None:
-            self._disturbance = self._disturbance + 0.5 * (self._high + self._low)
         self._disturbed = (
             self._rng.random(n) < how.epsilon if how.kind == "epsilon" else np.ones(n, dtype=np.bool_)
         )

@@ -13,6 +13,7 @@ Sec. 4 and Appendix A.1 (the bounds of the log variance).
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -54,9 +55,7 @@ class GaussianEnsemble(nn.Module):
         self.members, self.n_targets = members, n_targets
         self.generator = torch.Generator().manual_seed(seed)
         sizes = (n_inputs, *hidden, 2 * n_targets)
-        self.weights = nn.ParameterList(
-            nn.Parameter(torch.empty(members, a, b)) for a, b in zip(sizes[:-1], sizes[1:], strict=True)
-        )
+        self.weights = nn.ParameterList(nn.Parameter(torch.empty(members, a, b)) for a, b in pairwise(sizes))
         self.biases = nn.ParameterList(nn.Parameter(torch.zeros(members, 1, b)) for b in sizes[1:])
         self.highest = nn.Parameter(torch.full((n_targets,), _LOOSE))
         self.lowest = nn.Parameter(torch.full((n_targets,), _TIGHT))

@@ -145,6 +145,17 @@ for _spec in (
     AgentSpec("ppo-stack", _SB3, "SB3's PPO on the last 4 observations", _sb3("PPO", n_stack=4)),
     AgentSpec("sac", _SB3, "SB3's SAC on the last observation alone", _sb3("SAC")),
     AgentSpec("sac-stack", _SB3, "SB3's SAC on the last 4 observations", _sb3("SAC", n_stack=4)),
+    AgentSpec(
+        "dad-control",
+        "beliefgym.agents.dad_control:DaDControl",
+        "model-based: DAgger system identification with Data as Demonstrator, iLQR",
+    ),
+    AgentSpec(
+        "dagger-control",
+        "beliefgym.agents.dad_control:DaDControl",
+        "the same with the single-step model",
+        lambda env_id: {"dad": False},
+    ),
     AgentSpec("recurrent-ppo", _SB3, "sb3-contrib's RecurrentPPO (LSTM)", _sb3("RecurrentPPO")),
 ):
     register_agent(_spec)

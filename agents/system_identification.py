@@ -161,6 +161,7 @@ class SystemIdentification(Agent):
         self.num_timesteps = 0
         self.trials: list[Sequences] = []
         self._policies: list[ModelPolicy] = []
+        self._idle = _Constant(self.target[1])
         self._fitted: list[DynamicsModel] = []
 
     # ------------------------------------------------------------------------------------------------------- learning
@@ -306,6 +307,14 @@ class SystemIdentification(Agent):
             policy = self._synthesise(learned)
             ended = time.perf_counter()
             errors = model.errors(data)
+            if errors.n_diverged:
+                warnings.warn(
+                    f"{errors.n_diverged} of {data.n_episodes} trials diverge when the model predicts them from their "
+                    "first state; plans under it are not to be trusted far ahead. A larger ridge, a shorter planning "
+                    "horizon or more data would help; the loop goes on, and its next trial is such data",
+                    ModelWarning,
+                    stacklevel=2,
+                )
         told = list(dict.fromkeys(str(one.message) for one in caught))
         self._fitted.append(model)
         self._policies.append(policy)
@@ -340,7 +349,7 @@ class SystemIdentification(Agent):
                 ModelWarning,
                 stacklevel=2,
             )
-            return self._policies[-1] if before else _Constant(self.target[1])
+            return self._policies[-1] if before else self._idle
 
     def _angles(self) -> tuple[int, ...]:
         return self.coordinates.angles if self.filter is None else ()
@@ -399,8 +408,7 @@ class SystemIdentification(Agent):
     ) -> tuple[NDArray[Any], Any]:
         """See `Agent.predict`; the policies are deterministic. The returned state is changed by the next call.
 
-        Raises:
-            RuntimeError: nothing was learned yet.
+        Before anything was learned the action is the target's, u*.
         """
         return self.act(self.policy, observation, state, episode_start)
 
@@ -420,8 +428,8 @@ class SystemIdentification(Agent):
 
     @property
     def policy(self) -> ModelPolicy:
-        """The policy that `predict` runs."""
-        return self._policies[self.best_iteration]
+        """The policy that `predict` runs; doing nothing but u* before there is one."""
+        return self._policies[self.best_iteration] if self._policies else self._idle
 
     @property
     def dynamics(self) -> DynamicsModel:

@@ -7,6 +7,8 @@ The dynamics f(s, u) are linearised at every row of a batch,
 by reverse-mode differentiation. A system acts on each row by itself, so the gradient of one output component,
 summed over the rows, holds that row of every Jacobian: n backward passes for the whole batch. (On a CPU this is
 about three times as fast as n + m forward passes of `torch.func.jvp`, which go through Python for each product.)
+A small batch is repeated n times and each copy asked for another component: one backward pass, whose operations are
+then large enough to be worth their calls.
 All in float64; torch's threads are left as they are.
 """
 
@@ -22,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from beliefgym.envs.planning.learned_model import PlanningModel
 
 Floats = NDArray[np.float64]
+ROWS_AT_ONCE = 4096  # more than this are differentiated component by component
 
 
 def linearise(system: PlanningModel, state: ArrayLike, action: ArrayLike) -> tuple[Floats, Floats]:
@@ -47,9 +50,12 @@ def linearise(system: PlanningModel, state: ArrayLike, action: ArrayLike) -> tup
         _check_finite(np.concatenate([a, b], axis=-1), leading, f"the Jacobian of {type(system).__name__}")
         return a, b
 
-    z = torch.as_tensor(np.concatenate([s, u], axis=-1).reshape(-1, n + m)).requires_grad_()
-    with torch.enable_grad():
-        jacobian = _derivatives(system.flow(z[:, :n], z[:, n:]), z).reshape(*leading, n, n + m)
+    def flow(z: torch.Tensor) -> torch.Tensor:
+        moved: torch.Tensor = system.flow(z[:, :n], z[:, n:])
+        return moved
+
+    z = torch.as_tensor(np.concatenate([s, u], axis=-1).reshape(-1, n + m))
+    jacobian = _derivatives(flow, z, n)[1].reshape(*leading, n, n + m)
     _check_finite(jacobian, leading, f"the Jacobian of {type(system).__name__}.flow")
     return jacobian[..., :n], jacobian[..., n:]
 
@@ -76,11 +82,15 @@ def expand_cost(
     parts = [np.asarray(a, dtype=np.float64) for a in arguments]
     sizes = [p.shape[-1] for p in parts]
     leading = parts[0].shape[:-1]
-    z = torch.as_tensor(np.concatenate(parts, axis=-1).reshape(-1, sum(sizes))).requires_grad_()
-    with torch.enable_grad():
-        (gradient,) = torch.autograd.grad(cost(*torch.split(z, sizes, dim=-1)).sum(), z, create_graph=True)
-        h = _derivatives(gradient, z)
-    g = gradient.detach().numpy().reshape(*leading, -1)
+
+    def gradient(z: torch.Tensor) -> torch.Tensor:
+        total = cost(*torch.split(z, sizes, dim=-1)).sum()
+        (found,) = torch.autograd.grad(total, z, create_graph=True)
+        return found
+
+    z = torch.as_tensor(np.concatenate(parts, axis=-1).reshape(-1, sum(sizes)))
+    slopes, h = _derivatives(gradient, z, sum(sizes))
+    g = slopes.reshape(*leading, -1)
     h = 0.5 * (h + h.swapaxes(1, 2))
     name = getattr(cost, "__qualname__", type(cost).__name__)
     _check_finite(g[..., None], leading, f"the gradient of {name}")
@@ -111,15 +121,26 @@ def clip_eigenvalues(matrices: Floats) -> Floats:
     return clipped
 
 
-def _derivatives(outputs: torch.Tensor, inputs: torch.Tensor) -> Floats:
-    """d outputs_i / d inputs_j of each row: (rows, l) computed from (rows, k) -> (rows, l, k)."""
-    if not outputs.requires_grad:  # they are constant
-        return np.zeros((*outputs.shape, inputs.shape[1]))
-    gradients = [
-        torch.autograd.grad(outputs[:, i].sum(), inputs, retain_graph=True)[0]
-        for i in range(outputs.shape[1])
-    ]
-    return np.ascontiguousarray(torch.stack(gradients, dim=1).numpy())
+def _derivatives(
+    function: Callable[[torch.Tensor], torch.Tensor], inputs: torch.Tensor, n_outputs: int
+) -> tuple[Floats, Floats]:
+    """Values (rows, l) and derivatives d outputs_i / d inputs_j (rows, l, k) of a function of each row by itself."""
+    rows, k = inputs.shape
+    repeated = rows * n_outputs <= ROWS_AT_ONCE
+    with torch.enable_grad():
+        z = (inputs.repeat_interleave(n_outputs, dim=0) if repeated else inputs.clone()).requires_grad_()
+        outputs = function(z)
+        values = outputs.detach().numpy()[:: n_outputs if repeated else 1]
+        if not outputs.requires_grad:  # they are constant
+            return values, np.zeros((rows, n_outputs, k))
+        if repeated:
+            one_each = torch.eye(n_outputs, dtype=z.dtype).repeat(rows, 1)
+            (gradient,) = torch.autograd.grad(outputs, z, one_each)
+            return values, gradient.numpy().reshape(rows, n_outputs, k)
+        gradients = [
+            torch.autograd.grad(outputs[:, i].sum(), z, retain_graph=True)[0] for i in range(n_outputs)
+        ]
+        return values, np.ascontiguousarray(torch.stack(gradients, dim=1).numpy())
 
 
 def _rows(system: PlanningModel, state: ArrayLike, action: ArrayLike) -> tuple[Floats, Floats]:

@@ -16,6 +16,7 @@ optimization"; thesis proposal, Sec. 3.2.3 (iLQR about a nominal swing-up trajec
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from beliefgym.envs.planning.action_tree import tree_search
 from beliefgym.envs.planning.ilqr import ILQR
 from beliefgym.envs.planning.learned_model import PlanningModel
-from beliefgym.envs.planning.model_lqr import wrapped_difference
+from beliefgym.envs.planning.model_lqr import ModelWarning, wrapped_difference
 
 Floats = NDArray[np.float64]
 
@@ -166,7 +167,14 @@ class RecedingHorizon:
         bad = ~np.isfinite(solution.cost[which])
         plan.states[rows], plan.actions[rows] = solution.states[which], solution.actions[which]
         plan.gains[rows] = solution.gains[which]
-        if bad.any():  # every guess diverges under the model: do nothing, from here
+        if bad.any():
+            warnings.warn(
+                f"every first guess diverges under the model from {np.count_nonzero(bad)} of {len(rows)} states, the "
+                f"first {np.array2string(solution.states[which[bad]][0, 0], precision=3)}: nothing is done there until "
+                "a plan is found. A shorter horizon, a larger ridge or data from there would help",
+                ModelWarning,
+                stacklevel=4,
+            )
             lost = rows[bad]
             plan.states[lost] = solution.states[which[bad]][:, :1]
             plan.actions[lost], plan.gains[lost] = 0.0, 0.0
