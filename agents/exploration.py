@@ -110,7 +110,8 @@ class Explorer:
             self._sum[np.asarray(episode_start, dtype=np.bool_)] = 0.0
         half = 0.5 * (self._high - self._low)
         restored = np.clip(disturbance - self._how.restoring * self._sum, -half, half)
-        self._sum = self._sum + np.where(self._disturbed[:, None], restored, 0.0)
+        applied = self._disturbed[:, None] | (self._base is None)
+        self._sum = self._sum + np.where(applied, restored, 0.0)
         return restored
 
     def _draw(self, n: int) -> None:

@@ -72,7 +72,7 @@ class SystemIdentification(Agent):
         target: (x* (d,), u* (m,)), where a regulator is to go; None for the cheapest point of the cost.
         delays: observations that make up the state; 1 where one observation is the state. With more, see `DelayState`.
         filter: a fitted filter whose belief is the state, with `initial_belief(n)` and `update(belief, observation,
-            action)`; its beliefs begin with the coordinates, or `cost` is given. Not with delays.
+            action)`, whose action is the one that led to the observation, 0 at first. With `cost`; not with delays.
         trial_steps: length of a trial; the environment's own end if None.
         initial_trials: exploration trials before the first model.
         policy_trials, exploration_trials: trials of each iteration with the present policy, and with exploration.
@@ -145,7 +145,7 @@ class SystemIdentification(Agent):
             raise ValueError("expected delays=1 beside a filter: its belief is the state already")
         self.cost = self._cost_of_system() if cost is None else cost
         self._own_cost = cost is None
-        size = self._source.belief_size
+        size = np.asarray(self._source.initial_belief(1)).shape[1]
         self.target = (
             cheapest_point(self.cost, size, len(self._limits[0]), self.coordinates.angles, self._limits)
             if target is None
@@ -389,7 +389,8 @@ class SystemIdentification(Agent):
         belief = np.asarray(self._source.initial_belief(1))
         found = []
         for t in range(steps + 1):
-            belief = self._source.update(belief, x[t : t + 1], actions[t - 1 : t] if t else None)
+            action = actions[t - 1 : t] if t else np.zeros((1, actions.shape[1]))  # as in `act`
+            belief = self._source.update(belief, x[t : t + 1], action)
             found.append(belief)
         return np.concatenate(found)
 

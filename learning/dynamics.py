@@ -124,7 +124,7 @@ class DynamicsModel(BaseEstimator, ABC):
         """
         leading = observations.shape[:-1]
         z = self._observed.apply(observations.reshape(-1, self.n_obs_))
-        u = self._acted.apply(actions.reshape(-1, actions.shape[-1])[:, : self.n_act_])
+        u = self._acted.apply(actions.reshape(len(z), actions.shape[-1])[:, : self.n_act_])
         return self._observed.invert(self._step(z, u)).reshape(*leading, self.n_obs_)
 
     def errors(self, sequences: Sequences) -> MultiStepErrors:

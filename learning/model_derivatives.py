@@ -30,8 +30,9 @@ def derivatives(
     Args:
         model: fitted.
         observations: (..., n_obs). actions: (..., n_act), same leading shape.
-        step: of the central differences, where they are needed, in standard deviations of the training data; None for
-            1e-5, and 0.25 for trees and forests.
+        step: of the central differences, where they are needed, in the model's standardised units (standard deviations
+            of the training data, rad for its angles, the data's units where it does not standardise); None for 1e-5,
+            and 0.25 for trees and forests.
 
     Returns:
         A (..., n_obs, n_obs) and B (..., n_obs, n_act); B is 0 for actions that the model does not use.
@@ -41,7 +42,8 @@ def derivatives(
     """
     model._check_fitted()
     leading, n_given = observations.shape[:-1], actions.shape[-1]
-    x, u = observations.reshape(-1, observations.shape[-1]), actions.reshape(-1, n_given)
+    x = observations.reshape(-1, observations.shape[-1])
+    u = actions.reshape(len(x), n_given)
     z, v = model._observed.apply(x), model._acted.apply(u[:, : model.n_act_])
     regressor = getattr(model, "model_", None)
     if hasattr(regressor, "jacobian"):

@@ -83,6 +83,7 @@ class LinearQuadraticProblem:
                 stacklevel=2,
             )
         w = clip_eigenvalues(hessian)[0]
+        w = 0.5 * (w + w.T)  # to the last bit: python-control refuses what is not
         r = w[n:, n:] + SINGULAR * max(float(np.abs(w).max()), 1e-300) * np.eye(len(u))
         c = np.asarray(model.flow(x[None], u[None]))[0] - x
         return cls(a[0], b[0], c, w[:n, :n], r, w[:n, n:], slope[0, :n], slope[0, n:])
@@ -105,7 +106,7 @@ class LinearQuadraticProblem:
                 np.eye(len(closed)) - closed.T,
                 self.state_slope - gain.T @ self.action_slope + closed.T @ p @ self.c,
             )
-        except (np.linalg.LinAlgError, ValueError, control.ControlException) as error:
+        except (np.linalg.LinAlgError, ValueError) as error:
             warnings.warn(
                 f"the model's linearisation at the target has no stabilising regulator ({error}); the gains of "
                 f"{FALLBACK_STEPS} steps are taken instead. More data near the target, a larger ridge, or a cost that "
