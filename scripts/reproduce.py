@@ -23,6 +23,7 @@ REPRODUCTIONS = {
     "dad-video": "beliefgym.scripts.reproductions.dad_video:run",
     "control-cart-pole": "beliefgym.scripts.reproductions.control_cart_pole:run",
     "control-swing-up": "beliefgym.scripts.reproductions.control_trials:run",
+    "control-rivals": "beliefgym.scripts.reproductions.control_rivals:run",
     "control-helicopter": "beliefgym.scripts.reproductions.control_helicopter:run",
     "control-base": "beliefgym.scripts.reproductions.control_base:run",
     "control-arm": "beliefgym.scripts.reproductions.control_arm:run",
