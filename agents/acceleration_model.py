@@ -1,4 +1,4 @@
-"""`AccelerationModel`: a helicopter's accelerations learned in body axes, everything else integrated from what is known.
+"""`AccelerationModel`: a helicopter's accelerations learned in body axes, all else integrated from what is known.
 
 With v_b the velocity in body axes, w the body rates, u = u_prev + du the sticks and R the turn from body to NED,
 
@@ -230,7 +230,7 @@ class AccelerationModel(DynamicsModel):
         after[:, STICKS] = x[:, STICKS] + u
         after[:, CHANGES] = u
         pull = _stack(rotate(self._attitude(x), _parts(accelerations[:, :3])))
-        after[:, VELOCITY] = x[:, VELOCITY] + self.dt * (pull + [0.0, 0.0, self.gravity])
+        after[:, VELOCITY] = x[:, VELOCITY] + self.dt * (pull + np.array([0.0, 0.0, self.gravity]))
         after[:, POSITION] = x[:, POSITION] + self.dt * x[:, VELOCITY]
         after[:, RATES] = x[:, RATES] + self.dt * accelerations[:, 3:]
         d = x[:, ATTITUDE]
@@ -253,7 +253,8 @@ class AccelerationModel(DynamicsModel):
         for name, must in (("target", "delta"), ("standardise", False), ("use_actions", True)):
             if getattr(self, name) != must:
                 raise ValueError(
-                    f"expected {name} to stay {must!r}, got {getattr(self, name)!r}: this model works in the data's units"
+                    f"expected {name} to stay {must!r}, got {getattr(self, name)!r}: this model works in the data's "
+                    "units"
                 )
 
 

@@ -14,21 +14,16 @@ from __future__ import annotations
 
 import warnings
 from itertools import product
-from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from beliefgym.agents.dad_control import DaDControl
 from beliefgym.agents.policy_synthesis import RecedingHorizonSynthesis
 from beliefgym.learning import RandomFourierRidge, Ridge
-from beliefgym.scripts.reproductions.cells import run_cells
-from beliefgym.scripts.reproductions.control_figures import NAMES, cost_curves, mean_and_error
+from beliefgym.scripts.reproductions.control_loop import COLUMNS, NOTE, Comparison, Panel
 from beliefgym.scripts.reproductions.control_swing_up import TRIAL_STEPS, swing_up_task, try_fresh_starts
-from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
+from beliefgym.scripts.reproductions.report import Report, Request
 
-ITERATIONS, TEST_TRIALS = 8, 10
-TUNING_ITERATIONS, TUNING_SEEDS = 5, (100, 101)
+TEST_TRIALS = 10
 STATE_NOISE = 0.01
 NOISES = {"without actuation noise": 0.0, "with actuation noise": 1.0}
 LEARNERS: dict[str, tuple[str, str]] = {  # name -> (regressor, controller)
@@ -44,65 +39,59 @@ GRID: dict[str, list[dict[str, float]]] = {
     "ridge": [{"alpha": alpha} for alpha in (1e-6, 1e-2)],
     "rff": [{"alpha": alpha, "bandwidth": 4.0} for alpha in (1e-6, 1e-3)],
 }
-DAD_HORIZONS = (3, 10)
-VERSION = 1
+
+
+def _panel(learner: str, noise: str) -> Panel:
+    regressor, controller = LEARNERS[learner]
+    quiet = noise == "without actuation noise"
+    return Panel(
+        {
+            "version": 1,
+            "regressor": regressor,
+            "controller": controller,
+            "actuation_noise": NOISES[noise],
+            "state_noise": STATE_NOISE,
+        },
+        GRID[regressor],
+        "DaD below DAgger only" if quiet else "a smaller gain",
+        quiet,
+    )
+
+
+EXPERIMENT = Comparison(
+    name="control-cart-pole",
+    function=f"{__name__}:run_cell",
+    panels={f"{learner}, {noise}": _panel(learner, noise) for learner, noise in product(LEARNERS, NOISES)},
+    iterations=8,
+    tuning_iterations=5,
+    tuning_seeds=(100, 101),
+    dad_horizons=(3, 10),
+)
 
 
 def run(request: Request) -> Report:
     """Tune, then run both arms."""
-    folder = request.folder / "cells" / "control-cart-pole"
-    chosen = _tuned(request, folder)
-    seeds = range(request.seed, request.seed + request.seeds)
-    cells = {
-        _name(learner, noise, dad, seed): {
-            **chosen[learner, noise, dad],
-            "iterations": ITERATIONS,
-            "seed": seed,
-        }
-        for learner, noise, dad, seed in product(LEARNERS, NOISES, (False, True), seeds)
-    }
-    found = run_cells(f"{__name__}:run_cell", cells, folder, request.jobs, request.told)
-    rows: list[Row] = []
-    panels: dict[str, dict[str, Any]] = {}
-    for learner, noise in product(LEARNERS, NOISES):
-        runs = {
-            dad: [found[_name(learner, noise, dad, s)] for s in seeds if _ran(found, learner, noise, s)]
-            for dad in (False, True)
-        }
-        if not runs[False]:
-            rows.append({"what": f"{learner}, {noise}", "ours": "every run failed", "meets": False})
-            continue
-        panels[f"{learner},\n{noise}"] = {
-            NAMES[dad]: np.array([one["test_costs"] for one in runs[dad]]) for dad in (False, True)
-        }
-        rows.append(_row(learner, noise, runs, len(seeds)))
-    figure = "control-cart-pole.png"
-    if panels:
-        cost_curves(request.folder / figure, panels)
+    rows, chosen, figure = EXPERIMENT.run(request)
     return Report(
-        about=__doc__.split("\n\n", 1)[1].strip().replace("\n", " ") if __doc__ else "",
-        columns=("what", "thesis", "DAgger only", "DAgger + DaD", "gain", "gain at the end", "meets"),
+        about=(__doc__ or "").split("\n\n", 1)[1].strip().replace("\n", " "),
+        columns=COLUMNS,
         rows=rows,
         configuration={
             "trial_steps": TRIAL_STEPS,
-            "iterations": ITERATIONS,
+            "iterations": EXPERIMENT.iterations,
             "test_trials": TEST_TRIALS,
             "state_noise_std": STATE_NOISE,
             "actuation_noise_std_N": NOISES,
             "grid": GRID,
-            "dad_horizons": DAD_HORIZONS,
-            "tuning_seeds": TUNING_SEEDS,
-            "chosen": {" / ".join(map(str, key)): value for key, value in chosen.items()},
+            "dad_horizons": EXPERIMENT.dad_horizons,
+            "tuning_seeds": EXPERIMENT.tuning_seeds,
+            "chosen": chosen,
         },
         figures={
             figure: "Cumulative cost of each iteration's policy on 10 fresh starts, mean and standard error over seeds "
             "as a share of the panel's highest (after Fig. 3.11)."
         },
-        notes=[
-            "Costs are means over iterations and seeds with standard errors; a gain is the share of DAgger only's cost "
-            "that DaD takes away, over all iterations or over the last three, with its 95 % interval over paired "
-            "seeds. `meets` asks for a gain above 0 by its interval.",
-        ],
+        notes=[NOTE],
     )
 
 
@@ -144,74 +133,3 @@ def run_cell(cell: Any, extra: Any) -> dict[str, Any]:
         "interaction_steps": agent.num_timesteps,
         "told": sorted({text for one in agent.models for text in one["told"]}),
     }
-
-
-def _tuned(request: Request, folder: Path) -> dict[tuple[str, str, bool], dict[str, Any]]:
-    """Settings of each learner, noise and arm, from the tuning seeds."""
-    cells: dict[str, dict[str, Any]] = {}
-    options: dict[tuple[str, str, bool], list[tuple[dict[str, Any], list[str]]]] = {}
-    for learner, noise, dad in product(LEARNERS, NOISES, (False, True)):
-        regressor, controller = LEARNERS[learner]
-        for i, (settings, horizon) in enumerate(
-            product(GRID[regressor], DAD_HORIZONS if dad else DAD_HORIZONS[:1])
-        ):
-            cell = {
-                "version": VERSION,
-                "regressor": regressor,
-                "controller": controller,
-                "settings": settings,
-                "dad": dad,
-                "dad_horizon": horizon,
-                "actuation_noise": NOISES[noise],
-                "state_noise": STATE_NOISE,
-            }
-            names = []
-            for seed in TUNING_SEEDS:
-                name = f"tuning-{i}-{_name(learner, noise, dad, seed)}"
-                cells[name] = {**cell, "iterations": TUNING_ITERATIONS, "seed": seed}
-                names.append(name)
-            options.setdefault((learner, noise, dad), []).append((cell, names))
-    found = run_cells(f"{__name__}:run_cell", cells, folder, request.jobs, request.told)
-
-    def criterion(names: list[str]) -> float:
-        costs = [found[name].get("test_costs", [np.inf]) for name in names]
-        return float(np.mean([np.mean(one) for one in costs]))
-
-    return {key: min(several, key=lambda one: criterion(one[1]))[0] for key, several in options.items()}
-
-
-def _row(learner: str, noise: str, runs: dict[bool, list[dict[str, Any]]], n: int) -> Row:
-    costs = {dad: np.array([one["test_costs"] for one in ones]) for dad, ones in runs.items()}
-    texts = {}
-    for dad, c in costs.items():
-        mean, error = mean_and_error(c.mean(axis=1, keepdims=True))
-        texts[dad] = f"{mean[0]:.0f} ± {error[0]:.0f}"
-    gain = Interval.of(100.0 * (1.0 - costs[True].mean(axis=1) / costs[False].mean(axis=1)))
-    end = Interval.of(100.0 * (1.0 - costs[True][:, -3:].mean(axis=1) / costs[False][:, -3:].mean(axis=1)))
-    smaller = "DaD below DAgger only" if noise == "without actuation noise" else "a smaller gain"
-    return {
-        "what": f"{learner}, {noise}"
-        + ("" if len(costs[True]) == n else f" ({len(costs[True])} of {n} seeds)"),
-        "thesis": smaller,
-        "DAgger only": texts[False],
-        "DAgger + DaD": texts[True],
-        "gain": gain.text(".0f", " %"),
-        "gain at the end": end.text(".0f", " %"),
-        "meets": bool(gain.low > 0.0) if noise == "without actuation noise" else None,
-        "values": {
-            "gain": gain.to_dict(),
-            "gain_at_the_end": end.to_dict(),
-            "upright_at_the_end": {
-                NAMES[dad]: float(np.mean([one["upright"][-1] for one in ones])) for dad, ones in runs.items()
-            },
-        },
-    }
-
-
-def _ran(found: dict[str, Any], learner: str, noise: str, seed: int) -> bool:
-    return all("test_costs" in found[_name(learner, noise, dad, seed)] for dad in (False, True))
-
-
-def _name(learner: str, noise: str, dad: bool, seed: int) -> str:
-    parts = (learner, noise, "dad" if dad else "dagger")
-    return "-".join(part.replace(" ", "-").replace(",", "") for part in parts) + f"-{seed}"

@@ -132,16 +132,16 @@ def run(request: Request) -> Report:
 
 
 NOTES = [
-    "Costs are means of the summed stage cost over 100 fresh starts of 400 steps; `ours` is the geometric mean over all "
-    "iterations, with its 95 % interval over seeds, `last iteration` the mean over seeds with its standard error, "
+    "Costs are means of the summed stage cost over 100 fresh starts of 400 steps; `ours` is the geometric mean over "
+    "all iterations, with its 95 % interval over seeds, `last iteration` the mean over seeds with its standard error, "
     "`against the expert` that over the expert's cost on the same starts with its 95 % interval. `within 1.2 after` "
     "gives the transitions of the data when the mean over seeds first came, and from there stayed, within 1.2 times "
     "the expert's; at random exploration `meets` asks whether there is one.",
     "A comparison's `ours` is the ratio of geometric means, paired over seeds: the first named over the second.",
     "Random exploration must suit an action that is a change of the stick: white noise on it is a random walk of the "
-    "stick. Here each action takes back half of the sum of those before it. The regulator goes to the trim state, which "
-    "is where a trial starts up to its position; at the cost's own minimum the sticks are free, and random features far "
-    "from all data have no slope to go by.",
+    "stick. Here each action takes back half of the sum of those before it. The regulator goes to the trim state, "
+    "which is where a trial starts up to its position; at the cost's own minimum the sticks are free, and random "
+    "features far from all data have no slope to go by.",
     "Deviations: trials of 50 steps, so that an iteration has 100 transitions in two halves; the thesis's initial data "
     "also had one random trial beside the expert's, here the expert has noise of 0.03 on its actions. Exploration and "
     "DaD's rollout length were chosen by a few tries on tuning seeds 100 to 102.",
@@ -224,7 +224,8 @@ def _model(cell: Any) -> Any:
         if cell["learner"] == "ridge"
         else RandomFourierRidge(n_frequencies=200, include_inputs=True, random_state=0, **settings)
     )
-    return DataAsDemonstrator(regressor, **{**DAD, **({} if cell["dad"] else {"n_iterations": 0})})
+    n_iterations = DAD["n_iterations"] if cell["dad"] else 0
+    return DataAsDemonstrator(regressor, n_iterations=n_iterations, horizon=DAD["horizon"])
 
 
 def _cell(learner: str, dad: bool, exploration: str, settings: dict[str, Any]) -> dict[str, Any]:
@@ -276,8 +277,8 @@ def _row(line: str, runs: list[dict[str, Any]], expert: float, n: int) -> Row:
     reached = first < len(mean)
     return {
         "what": line + ("" if len(runs) == n else f" ({len(runs)} of {n} seeds)"),
-        "ours": geometric.text(".3g"),
-        "last iteration": f"{mean[-1]:.3g} ± {error[-1]:.2g}",
+        "ours": geometric.text(",.0f"),
+        "last iteration": f"{mean[-1]:,.0f} ± {error[-1]:,.0f}",
         "against the expert": ratio.text(".2f"),
         "within 1.2 after": f"{transitions[first]:.0f} (iteration {first + 1})" if reached else "not reached",
         "meets": reached if "random exploration" in line or line in ACCELERATION else None,
@@ -374,7 +375,8 @@ def _draw(
 
 def _of_logs(logs: NDArray[np.float64]) -> Interval:
     one = Interval.of(logs)
-    return Interval(*(float(np.exp(value)) for value in (one.mean, one.low, one.high)), one.n)
+    mean, low, high = (float(np.exp(value)) for value in (one.mean, one.low, one.high))
+    return Interval(mean, low, high, one.n)
 
 
 def _line(learner: str, dad: bool, exploration: str) -> str:
