@@ -72,3 +72,31 @@ def test_the_guide_to_dad_runs(tmp_path, monkeypatch):
     imageio.imwrite("clip.mp4", np.repeat(wave[..., None], 3, axis=3).astype(np.uint8), fps=25)
     exec(video_example, names)
     assert names["pictures"].shape == (17, 12, 16)
+
+
+@in_checkout
+def test_the_guide_to_control_learns_and_saves(tmp_path, monkeypatch, capsys):
+    """Its example as it stands: four trials, whose last is cheaper than the random first one."""
+    guide = (README.parent / "docs" / "model-based-control.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", guide, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(example, names)
+    costs = [trial["cost"] for trial in names["agent"].history]
+    assert len(costs) == 4
+    assert min(costs[1:]) < costs[0]
+    assert Path("swing-up.zip").exists()
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+@in_checkout
+def test_the_readmes_agent_acts_after_six_trials():
+    (example,) = (
+        block
+        for block in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+        if "DaDControl" in block
+    )
+    names: dict = {"observation": np.array([0.0, -1.0, 0.0, 0.0, 0.0], dtype=np.float32)}
+    exec(example, names)
+    assert names["action"].shape == (1,)
+    assert names["agent"].num_timesteps >= 360

@@ -1,10 +1,10 @@
 """`beliefgym reproduce control-rivals`: the cart-pole swing-up in a handful of trials, ours and its rivals.
 
 DaD+Control and DAgger only stand beside PETS, PILCO and model-free SAC. All run the trials of `control_swing_up` and
-are tried on its fresh starts after every trial, SAC after as many as `SAC_TRIALS` says. Ours and PETS plan with the stage
-cost; PILCO searches its policy with its own saturating cost of the pole's tip; SAC learns from the environment's reward
-with the settings that it has on this task in the leaderboard, but from one copy and with the first trial alone as
-exploration. All are judged by the stage cost.
+are tried on its fresh starts after every trial, SAC after as many as `SAC_TRIALS` says. Ours and PETS plan with the
+stage cost; PILCO searches its policy with its own saturating cost of the pole's tip; SAC learns from the environment's
+reward with the settings that it has on this task in the leaderboard, but from one copy and with the first trial alone
+as exploration. All are judged by the stage cost.
 
 A cell is {"method": one of `METHODS`, "seed": s, "trials": N, "parameters": {...}}: N trials after the
 exploration trial, in an environment with these parameters. Optional: "options" of the agent, "patience" (the cell ends
@@ -101,8 +101,8 @@ def run(request: Request) -> Report:
             "of horizon, candidates, network and training steps on seeds 100 and 101; PILCO by two settings on "
             "seed 100; it stands on TorchRL 0.14's Gaussian-process model and policy, needs gpytorch and botorch, "
             "and was given 3 seeds; what it reaches here says little about PILCO at its best (it solves its own, "
-            "slower cart-pole in about 17.5 s of interaction by its authors' report). SAC has the leaderboard's settings for "
-            "this task and is tried only at some trials.",
+            "slower cart-pole in about 17.5 s of interaction by its authors' report). SAC has the leaderboard's "
+            "settings for this task and is tried only at some trials.",
         ],
     )
 
