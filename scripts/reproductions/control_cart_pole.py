@@ -19,7 +19,7 @@ from typing import Any
 from beliefgym.agents.dad_control import DaDControl
 from beliefgym.agents.policy_synthesis import RecedingHorizonSynthesis
 from beliefgym.learning import RandomFourierRidge, Ridge
-from beliefgym.scripts.reproductions.control_loop import COLUMNS, NOTE, Comparison, Panel
+from beliefgym.scripts.reproductions.control_loop import Comparison, Panel
 from beliefgym.scripts.reproductions.control_swing_up import TRIAL_STEPS, swing_up_task, try_fresh_starts
 from beliefgym.scripts.reproductions.report import Report, Request
 
@@ -71,27 +71,17 @@ EXPERIMENT = Comparison(
 
 def run(request: Request) -> Report:
     """Tune, then run both arms."""
-    rows, chosen, figure = EXPERIMENT.run(request)
-    return Report(
-        about=(__doc__ or "").split("\n\n", 1)[1].strip().replace("\n", " "),
-        columns=COLUMNS,
-        rows=rows,
-        configuration={
+    return EXPERIMENT.report(
+        request,
+        __doc__ or "",
+        "Cumulative cost of each iteration's policy on 10 fresh starts, mean and standard error over seeds as a share "
+        "of the panel's highest (after Fig. 3.11).",
+        {
             "trial_steps": TRIAL_STEPS,
-            "iterations": EXPERIMENT.iterations,
             "test_trials": TEST_TRIALS,
             "state_noise_std": STATE_NOISE,
             "actuation_noise_std_N": NOISES,
-            "grid": GRID,
-            "dad_horizons": EXPERIMENT.dad_horizons,
-            "tuning_seeds": EXPERIMENT.tuning_seeds,
-            "chosen": chosen,
         },
-        figures={
-            figure: "Cumulative cost of each iteration's policy on 10 fresh starts, mean and standard error over seeds "
-            "as a share of the panel's highest (after Fig. 3.11)."
-        },
-        notes=[NOTE],
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from beliefgym.scripts.leaderboard.plots import FAINT
@@ -75,6 +76,8 @@ def cost_curves(
             else:
                 ax.set_ylim(bottom=0)
             plain(ax, title, x_label, "")
-            ax.legend(frameon=False)
+            ax.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=8)
+            if x is None:
+                ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes[0].set_ylabel("cumulative cost" + ("" if normalise == "no" else ", share of the highest"))
         save(figure, path)

@@ -20,7 +20,7 @@ from beliefgym.agents.system_identification import SystemIdentification
 from beliefgym.learning import Sequences
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.control_figures import NAMES, cost_curves, mean_and_error
-from beliefgym.scripts.reproductions.report import Interval, Request, Row
+from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 from beliefgym.wrappers.task import Task
 
 Floats = NDArray[np.float64]
@@ -99,6 +99,31 @@ class Comparison:
         if drawn:
             cost_curves(request.folder / figure, drawn, log=log)
         return rows, {" / ".join(map(str, key)): value for key, value in chosen.items()}, figure
+
+    def report(self, request: Request, about: str, caption: str, configuration: Mapping[str, Any]) -> Report:
+        """`run`, written up.
+
+        Args:
+            request: of the command. about: the module's docstring, whose first line is left out.
+            caption: of the figure. configuration: beyond the comparison's own.
+        """
+        rows, chosen, figure = self.run(request)
+        return Report(
+            about=about.split("\n\n", 1)[1].strip().replace("\n", " "),
+            columns=COLUMNS,
+            rows=rows,
+            configuration={
+                **configuration,
+                "grids": {title: list(panel.grid) for title, panel in self.panels.items()},
+                "iterations": self.iterations,
+                "dad_horizons": list(self.dad_horizons),
+                "tuning_iterations": self.tuning_iterations,
+                "tuning_seeds": list(self.tuning_seeds),
+                "chosen": chosen,
+            },
+            figures={figure: caption},
+            notes=[NOTE],
+        )
 
     def _tuned(self, request: Request, folder: Path) -> dict[tuple[str, bool], dict[str, Any]]:
         """The cell of each panel and arm with its best settings."""

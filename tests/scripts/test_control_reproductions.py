@@ -8,9 +8,9 @@ import pytest
 from beliefgym.agents import DaDControl
 from beliefgym.scripts.reproduce import REPRODUCTIONS
 from beliefgym.scripts.reproductions import (
-    control_arm,
-    control_base,
+    control_baxter,
     control_cart_pole,
+    control_erratic,
     control_helicopter,
     control_loop,
     control_rivals,
@@ -74,8 +74,8 @@ CELLS = {
             "actuation_noise": 1.0,
         },
     ),
-    "base": (control_base, {"regressor": "quadratic", "settings": {"alpha": 1e-2}}),
-    "arm": (control_arm, {"settings": {"alpha": 1e-2}, "actuation_noise": 1.0}),
+    "base": (control_erratic, {"regressor": "quadratic", "settings": {"alpha": 1e-2}}),
+    "arm": (control_baxter, {"settings": {"alpha": 1e-2}, "actuation_noise": 1.0}),
 }
 
 
@@ -138,8 +138,8 @@ def test_rivals_run_the_same_trials(monkeypatch):
 
 def test_every_control_experiment_is_registered():
     modules = (
-        control_arm,
-        control_base,
+        control_baxter,
+        control_erratic,
         control_cart_pole,
         control_helicopter,
         control_rivals,

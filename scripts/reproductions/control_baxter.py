@@ -20,7 +20,7 @@ from beliefgym.agents.exploration import Exploration
 from beliefgym.agents.policy_synthesis import RegulatorSynthesis
 from beliefgym.envs.baxter import NEUTRAL
 from beliefgym.learning import Ridge
-from beliefgym.scripts.reproductions.control_loop import COLUMNS, NOTE, Comparison, Panel, run_loop
+from beliefgym.scripts.reproductions.control_loop import Comparison, Panel, run_loop
 from beliefgym.scripts.reproductions.report import Report, Request
 from beliefgym.wrappers.task import Task
 
@@ -70,27 +70,12 @@ class ReachCost:
 
 def run(request: Request) -> Report:
     """Tune, then run both arms."""
-    rows, chosen, figure = EXPERIMENT.run(request)
-    return Report(
-        about=(__doc__ or "").split("\n\n", 1)[1].strip().replace("\n", " "),
-        columns=COLUMNS,
-        rows=rows,
-        configuration={
-            "trial_steps": TRIAL_STEPS,
-            "test_trials": TEST_TRIALS,
-            "iterations": EXPERIMENT.iterations,
-            "noise_N_m": NOISE,
-            "noises": NOISES,
-            "grid": GRID,
-            "dad_horizons": EXPERIMENT.dad_horizons,
-            "tuning_seeds": EXPERIMENT.tuning_seeds,
-            "chosen": chosen,
-        },
-        figures={
-            figure: "Cumulative cost of each iteration's policy on 20 fresh starts, mean and standard error over seeds "
-            "as a share of the panel's highest (after Fig. 3.14)."
-        },
-        notes=[NOTE],
+    return EXPERIMENT.report(
+        request,
+        __doc__ or "",
+        "Cumulative cost of each iteration's policy on 20 fresh starts, mean and standard error over seeds as a share "
+        "of the panel's highest (after Fig. 3.14).",
+        {"trial_steps": TRIAL_STEPS, "test_trials": TEST_TRIALS, "noise_N_m": NOISE, "noises": NOISES},
     )
 
 

@@ -19,7 +19,7 @@ from beliefgym.agents.exploration import Exploration
 from beliefgym.agents.policy_synthesis import OpenLoopSynthesis
 from beliefgym.envs.planning.open_loop import ProportionalLaw
 from beliefgym.learning import PolynomialRidge, Ridge
-from beliefgym.scripts.reproductions.control_loop import COLUMNS, NOTE, Comparison, Panel, run_loop
+from beliefgym.scripts.reproductions.control_loop import Comparison, Panel, run_loop
 from beliefgym.scripts.reproductions.report import Report, Request
 from beliefgym.wrappers.task import Task
 
@@ -56,26 +56,12 @@ class GoalDistance:
 
 def run(request: Request) -> Report:
     """Tune, then run both arms."""
-    rows, chosen, figure = EXPERIMENT.run(request)
-    return Report(
-        about=(__doc__ or "").split("\n\n", 1)[1].strip().replace("\n", " "),
-        columns=COLUMNS,
-        rows=rows,
-        configuration={
-            "task": TASK.to_dict(),
-            "trial_steps": TRIAL_STEPS,
-            "test_trials": TEST_TRIALS,
-            "iterations": EXPERIMENT.iterations,
-            "grid": GRID,
-            "dad_horizons": EXPERIMENT.dad_horizons,
-            "tuning_seeds": EXPERIMENT.tuning_seeds,
-            "chosen": chosen,
-        },
-        figures={
-            figure: "Cumulative cost of each iteration's open-loop policy on 20 fresh starts, mean and standard error "
-            "over seeds, as a share of the panel's highest (after Fig. 3.13)."
-        },
-        notes=[NOTE],
+    return EXPERIMENT.report(
+        request,
+        __doc__ or "",
+        "Cumulative cost of each iteration's open-loop policy on 20 fresh trials, mean and standard error over seeds as a "
+        "share of the panel's highest (after Fig. 3.13).",
+        {"trial_steps": TRIAL_STEPS, "test_trials": TEST_TRIALS, "task": TASK.to_dict()},
     )
 
 
