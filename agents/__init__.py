@@ -10,6 +10,7 @@ from beliefgym.agents.policy_synthesis import (
     RecedingHorizonSynthesis,
     RegulatorSynthesis,
 )
+from beliefgym.agents.probabilistic_ensemble import ProbabilisticEnsembleControl
 from beliefgym.agents.random_agent import RandomAgent
 from beliefgym.agents.registry import (
     AgentSpec,
@@ -30,6 +31,7 @@ __all__ = [
     "Expert",
     "Exploration",
     "OpenLoopSynthesis",
+    "ProbabilisticEnsembleControl",
     "RandomAgent",
     "RecedingHorizonSynthesis",
     "RegulatorSynthesis",

@@ -134,6 +134,11 @@ def _sb3(algorithm: str, **more: Any) -> Callable[[str], dict[str, Any]]:
     return lambda env_id: {**hyperparameters(algorithm, env_id), **more}
 
 
+def _delays(env_id: str) -> dict[str, Any]:
+    """Two observations make the state where positions alone are shown."""
+    return {"delays": 2} if env_id.rpartition("-v")[0].endswith("Position") else {}
+
+
 _SB3 = "beliefgym.agents.sb3_agent:SB3Agent"
 
 for _spec in (
@@ -149,12 +154,18 @@ for _spec in (
         "dad-control",
         "beliefgym.agents.dad_control:DaDControl",
         "model-based: DAgger system identification with Data as Demonstrator, iLQR",
+        lambda env_id: _delays(env_id),
     ),
     AgentSpec(
         "dagger-control",
         "beliefgym.agents.dad_control:DaDControl",
         "the same with the single-step model",
-        lambda env_id: {"dad": False},
+        lambda env_id: {"dad": False, **_delays(env_id)},
+    ),
+    AgentSpec(
+        "pets",
+        "beliefgym.agents.probabilistic_ensemble:ProbabilisticEnsembleControl",
+        "model-based rival: ensemble of probabilistic networks, trajectory sampling, cross-entropy planning",
     ),
     AgentSpec("recurrent-ppo", _SB3, "sb3-contrib's RecurrentPPO (LSTM)", _sb3("RecurrentPPO")),
 ):

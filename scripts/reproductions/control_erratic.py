@@ -59,8 +59,8 @@ def run(request: Request) -> Report:
     return EXPERIMENT.report(
         request,
         __doc__ or "",
-        "Cumulative cost of each iteration's open-loop policy on 20 fresh trials, mean and standard error over seeds as a "
-        "share of the panel's highest (after Fig. 3.13).",
+        "Cumulative cost of each iteration's open-loop policy on 20 fresh trials, mean and standard error over seeds "
+        "as a share of the panel's highest (after Fig. 3.13).",
         {"trial_steps": TRIAL_STEPS, "test_trials": TEST_TRIALS, "task": TASK.to_dict()},
     )
 

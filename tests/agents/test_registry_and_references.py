@@ -54,7 +54,22 @@ def test_the_reference_agents_act_in_every_environment(env_id):
         _act_once(name, env_id)
 
 
-@pytest.mark.parametrize("name", agent_specs())
+MODEL_BASED = ("dad-control", "dagger-control", "pets")
+
+
+@pytest.mark.parametrize("name", MODEL_BASED)
+def test_the_model_based_agents_act_where_the_cost_can_be_read_off_what_is_shown(name):
+    _act_once(name, "beliefgym/CartPoleSwingUp-v0")
+    if name != "pets":
+        _act_once(name, "beliefgym/PendulumPosition-v0")  # by two observations
+        _act_once(name, "beliefgym/HelicopterHover-v0")
+    with pytest.raises(ValueError, match=r"expected .*MicoLift.*; give a cost"):
+        make_agent(name, "beliefgym/MicoLiftTorque-v0")
+    with pytest.raises(ValueError, match=r"cost=.* for .*HopperPosition|got HopperPosition.*; give a cost"):
+        make_agent(name, "beliefgym/HopperPosition-v0")
+
+
+@pytest.mark.parametrize("name", [name for name in agent_specs() if name not in MODEL_BASED])
 @pytest.mark.parametrize(
     "env_id",
     [
