@@ -77,7 +77,6 @@ class MobileBaseKinematic(System):
     Args:
         max_speed: m/s. max_turning: rad/s.
         start_distance: m.
-        start_pose: (x, y, theta) in m and rad, where every episode starts instead; drawn as above if None.
         landmarks: ((x, y), ...) in m in the goal's frame, three of them.
         field_of_view: rad, the whole angle in which landmarks are seen, around straight ahead.
 
@@ -89,7 +88,6 @@ class MobileBaseKinematic(System):
     max_speed: float = 0.5
     max_turning: float = math.radians(100.0)
     start_distance: float = 3.0
-    start_pose: tuple[float, float, float] | None = None
     landmarks: tuple[tuple[float, float], ...] = ((2.5, 1.5), (2.5, -1.5), (-2.5, 0.0))
     field_of_view: float = math.pi
 
@@ -107,10 +105,6 @@ class MobileBaseKinematic(System):
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmarks", tuple((float(x), float(y)) for x, y in self.landmarks))
         super().__post_init__()
-        if self.start_pose is not None:
-            object.__setattr__(self, "start_pose", tuple(float(value) for value in self.start_pose))
-            if len(self.start_pose) != 3 or not np.isfinite(self.start_pose).all():
-                raise ValueError(f"expected start_pose as three finite numbers, got {self.start_pose!r}")
         for name in ("max_speed", "max_turning", "start_distance", "field_of_view"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"expected {name} above 0, got {getattr(self, name)!r}")
@@ -187,10 +181,8 @@ class MobileBaseKinematic(System):
     def initial_state(
         self, streams: RandomStreams, mask: NDArray[np.bool_] | None = None
     ) -> NDArray[np.float64]:
-        """At rest, uniform in the disc, any heading; or at start_pose."""
+        """At rest, uniform in the disc, any heading."""
         drawn = streams.uniform(3, mask)
-        if self.start_pose is not None:
-            return np.tile(np.append(self.start_pose, np.zeros(self.n_state - 3)), (len(drawn), 1))
         distance, angle = self.start_distance * np.sqrt(drawn[:, 0]), 2.0 * np.pi * drawn[:, 1]
         state = np.zeros((len(drawn), self.n_state))
         state[:, 0], state[:, 1] = distance * np.cos(angle), distance * np.sin(angle)

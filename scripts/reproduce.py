@@ -25,8 +25,8 @@ REPRODUCTIONS = {
     "control-swing-up": "beliefgym.scripts.reproductions.control_trials:run",
     "control-rivals": "beliefgym.scripts.reproductions.control_rivals:run",
     "control-helicopter": "beliefgym.scripts.reproductions.control_helicopter:run",
-    "control-base": "beliefgym.scripts.reproductions.control_erratic:run",
-    "control-arm": "beliefgym.scripts.reproductions.control_baxter:run",
+    "control-base": "beliefgym.scripts.reproductions.control_base:run",
+    "control-arm": "beliefgym.scripts.reproductions.control_arm:run",
 }
 
 

@@ -1,4 +1,4 @@
-"""DaD+DAgger against DAgger only on one platform: tuning, runs, rows and the figure, shared by the experiments.
+"""DaD+DAgger against DAgger only on one platform: tuning, runs, rows and the figure, for one experiment of several panels.
 
 Each panel (a learner on a platform) has two arms that differ in the flag `dad` alone. Settings of each arm are chosen
 from the same grid by the same criterion, the mean over iterations and tuning seeds of the cost on fresh starts; the
@@ -16,16 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefgym.agents.system_identification import SystemIdentification
-from beliefgym.learning import Sequences
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.control_figures import NAMES, cost_curves, mean_and_error
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
-from beliefgym.wrappers.task import Task
 
 Floats = NDArray[np.float64]
 COLUMNS = ("what", "thesis", "DAgger only", "DAgger + DaD", "gain", "gain at the end", "meets")
-TEST_SEED = 1_000_000  # starts that no training trial has
 LAST = 3  # iterations that count as the end
 NOTE = (
     "Costs are means over iterations and seeds with standard errors; a gain is the share of DAgger only's cost that "
@@ -145,62 +141,12 @@ class Comparison:
         return {key: min(several, key=lambda one: criterion(one[1]))[0] for key, several in options.items()}
 
 
-def run_fresh(agent: SystemIdentification, task: Task, n: int, n_steps: int) -> tuple[Floats, Sequences]:
-    """An agent's policy from n fresh starts.
-
-    Returns:
-        (n,) the summed cost, by the agent's own cost of coordinates, and the trajectories of coordinates and actions.
-        For environments that do not end within n_steps.
-    """
-    env = task.make_vec(n)
-    observation, _ = env.reset(seed=TEST_SEED)
-    state: Any = None
-    start = np.ones(n, dtype=np.bool_)
-    states, actions = [agent.coordinates.encode(observation)], []
-    costs = np.zeros(n)
-    for _ in range(n_steps):
-        action, state = agent.predict(observation, state=state, episode_start=start, deterministic=True)
-        observation, _, terminated, truncated, _ = env.step(action)
-        if (terminated | truncated).any():
-            raise ValueError(
-                f"expected {task.label} to last for {n_steps} steps, got an end; take fewer steps"
-            )
-        start = np.zeros(n, dtype=np.bool_)
-        actions.append(np.asarray(action, dtype=float))
-        costs += np.asarray(agent.cost(states[-1], actions[-1]))
-        states.append(agent.coordinates.encode(observation))
-    env.close()
-    return costs, Sequences.from_observations(np.stack(states, axis=1), actions=np.stack(actions, axis=1))
-
-
-def run_loop(agent: SystemIdentification, iterations: int, n: int, n_steps: int) -> dict[str, Any]:
-    """The loop with a test of each iteration's policy: "test_costs", "test_errors" and the trials' costs.
-
-    "test_errors" are the multi-step errors of the iteration's model on the trajectories that its policy then made.
-    """
-    costs, errors = [], []
-    for _ in range(iterations):
-        agent.run_iterations(1)
-        cost, made = run_fresh(agent, agent.task, n, n_steps)
-        costs.append(float(cost.mean()))
-        errors.append(agent.dynamics.errors(made).mean)
-    return {
-        "test_costs": costs,
-        "test_errors": errors,
-        "trial_costs": [one["cost"] for one in agent.models],
-        "interaction_steps": agent.num_timesteps,
-        "told": sorted({text for one in agent.models for text in one["told"]}),
-    }
-
-
 def _row(title: str, panel: Panel, runs: dict[bool, list[dict[str, Any]]], n: int) -> Row:
     costs = {dad: np.array([one["test_costs"] for one in ones]) for dad, ones in runs.items()}
-    texts, errors = {}, {}
+    texts = {}
     for dad, ones in runs.items():
         mean, error = mean_and_error(costs[dad].mean(axis=1, keepdims=True))
         texts[dad] = f"{mean[0]:,.4g} ± {error[0]:.2g}"
-        if "test_errors" in ones[0]:
-            errors[NAMES[dad]] = float(np.mean([one["test_errors"] for one in ones]))
     gain = Interval.of(100.0 * (1.0 - costs[True].mean(axis=1) / costs[False].mean(axis=1)))
     end = Interval.of(
         100.0 * (1.0 - costs[True][:, -LAST:].mean(axis=1) / costs[False][:, -LAST:].mean(axis=1))
@@ -216,7 +162,6 @@ def _row(title: str, panel: Panel, runs: dict[bool, list[dict[str, Any]]], n: in
         "values": {
             "gain": gain.to_dict(),
             "gain_at_the_end": end.to_dict(),
-            "multi_step_errors_on_own_trajectories": errors,
         },
     }
 

@@ -8,11 +8,10 @@ import pytest
 from beliefgym.agents import DaDControl
 from beliefgym.scripts.reproduce import REPRODUCTIONS
 from beliefgym.scripts.reproductions import (
-    control_baxter,
+    control_arm,
+    control_base,
     control_cart_pole,
-    control_erratic,
     control_helicopter,
-    control_loop,
     control_rivals,
     control_trials,
 )
@@ -64,26 +63,18 @@ def failing_cell(cell, extra):
     raise RuntimeError("no luck")
 
 
-CELLS = {
-    "cart-pole": (
-        control_cart_pole,
-        {
-            "regressor": "ridge",
-            "controller": "plan",
-            "settings": {"alpha": 1e-2},
-            "actuation_noise": 1.0,
-        },
-    ),
-    "base": (control_erratic, {"regressor": "quadratic", "settings": {"alpha": 1e-2}}),
-    "arm": (control_baxter, {"settings": {"alpha": 1e-2}, "actuation_noise": 1.0}),
-}
-
-
-@pytest.mark.parametrize("name", CELLS)
-def test_a_cell_gives_a_cost_for_each_iteration(name):
-    module, cell = CELLS[name]
-    cell = {"dad": True, "dad_horizon": 5, "iterations": 2, "seed": 100, **cell}
-    result = json.loads(json.dumps(module.run_cell(cell, None)))
+def test_a_cart_pole_cell_gives_a_cost_for_each_iteration():
+    cell = {
+        "regressor": "ridge",
+        "controller": "plan",
+        "settings": {"alpha": 1e-2},
+        "actuation_noise": 1.0,
+        "dad": True,
+        "dad_horizon": 5,
+        "iterations": 2,
+        "seed": 100,
+    }
+    result = json.loads(json.dumps(control_cart_pole.run_cell(cell, None)))
     assert len(result["test_costs"]) == len(result["trial_costs"]) == 2
     assert np.isfinite(result["test_costs"]).all()
     assert min(result["test_costs"]) > 0.0
@@ -138,8 +129,8 @@ def test_rivals_run_the_same_trials(monkeypatch):
 
 def test_every_control_experiment_is_registered():
     modules = (
-        control_baxter,
-        control_erratic,
+        control_arm,
+        control_base,
         control_cart_pole,
         control_helicopter,
         control_rivals,
@@ -147,4 +138,3 @@ def test_every_control_experiment_is_registered():
     )
     targets = {target for name, target in REPRODUCTIONS.items() if name.startswith("control-")}
     assert targets == {f"{module.__name__}:run" for module in modules}
-    assert control_loop.TEST_SEED >= 1_000_000
