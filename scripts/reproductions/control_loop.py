@@ -1,4 +1,4 @@
-"""DaD+DAgger against DAgger only on one platform: tuning, runs, rows and the figure, for one experiment of several panels.
+"""DaD+DAgger against DAgger only on one platform: tuning, runs, rows and the figure of one experiment.
 
 Each panel (a learner on a platform) has two arms that differ in the flag `dad` alone. Settings of each arm are chosen
 from the same grid by the same criterion, the mean over iterations and tuning seeds of the cost on fresh starts; the
@@ -144,8 +144,8 @@ class Comparison:
 def _row(title: str, panel: Panel, runs: dict[bool, list[dict[str, Any]]], n: int) -> Row:
     costs = {dad: np.array([one["test_costs"] for one in ones]) for dad, ones in runs.items()}
     texts = {}
-    for dad, ones in runs.items():
-        mean, error = mean_and_error(costs[dad].mean(axis=1, keepdims=True))
+    for dad, several in costs.items():
+        mean, error = mean_and_error(several.mean(axis=1, keepdims=True))
         texts[dad] = f"{mean[0]:,.4g} ± {error[0]:.2g}"
     gain = Interval.of(100.0 * (1.0 - costs[True].mean(axis=1) / costs[False].mean(axis=1)))
     end = Interval.of(
