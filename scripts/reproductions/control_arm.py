@@ -25,7 +25,7 @@ from beliefgym.agents.exploration import Exploration
 from beliefgym.agents.policy_synthesis import RegulatorSynthesis
 from beliefgym.envs.baxter import NEUTRAL, BaxterReach
 from beliefgym.learning import Ridge, Sequences
-from beliefgym.scripts.reproductions.control_base import (
+from beliefgym.scripts.reproductions.control_platforms import (
     DAD_ITERATIONS,
     HELD_OUT_SEED,
     TEST_SEED,
