@@ -96,7 +96,7 @@ CONDITIONS: dict[str, Condition] = {
     "position and velocity, a weak model (20 features)": Condition(FULL, 0.0, 1, 1e-8, 4.0, 10, 20),
     "position and velocity, measurement noise 0.01": Condition(FULL, 0.01, 1, 1e-4, 4.0, 10),
     "position only (2 delays)": Condition(POSITION, 0.0, 2, 1e-6, 6.0, 10),
-    "position only, measurement noise 0.01 (4 delays)": Condition(POSITION, 0.01, 4, 1e-4, 6.0, 5),
+    "position only, measurement noise 0.01 (4 delays)": Condition(POSITION, 0.01, 4, 1e-4, 6.0, 2),
 }
 
 
