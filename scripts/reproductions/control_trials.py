@@ -96,7 +96,6 @@ CONDITIONS: dict[str, Condition] = {
     "position and velocity, a weak model (20 features)": Condition(FULL, 0.0, 1, 1e-8, 4.0, 10, 20),
     "position and velocity, measurement noise 0.01": Condition(FULL, 0.01, 1, 1e-4, 4.0, 10),
     "position only (2 delays)": Condition(POSITION, 0.0, 2, 1e-6, 6.0, 10),
-    "position only, measurement noise 0.01 (4 delays)": Condition(POSITION, 0.01, 4, 1e-4, 6.0, 2),
 }
 
 
@@ -152,6 +151,8 @@ def run(request: Request) -> Report:
             "Ridge, bandwidth and delays of each condition were chosen by short runs without DaD on seeds from 200 on "
             "(and on 0 to 7 with a start-state generator of another kind), which no reported run shares; DaD has the "
             "same ones.",
+            "Positions alone with measurement noise 0.01 on them are beyond what four delays give: five runs "
+            "without DaD needed 7, 7, 8, more than 9 and more than 10 policy trials; a filter would be the way.",
         ],
     )
 

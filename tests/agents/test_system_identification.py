@@ -241,7 +241,7 @@ def test_the_best_policy_is_that_of_the_lowest_mean_cost_and_last_is_last():
 
 
 class Counts(BaseCallback):
-    """Notes num_timesteps at every call; stops after so many."""
+    """Notes num_timesteps at every call; says once, at a call in the middle of a trial, that it is enough."""
 
     def __init__(self, stop=np.inf):
         super().__init__()
@@ -255,7 +255,7 @@ class Counts(BaseCallback):
 
     def _on_step(self):
         self.seen.append(self.num_timesteps)
-        return self.n_calls < self.stop
+        return self.n_calls != self.stop
 
 
 @pytest.mark.parametrize("as_list", [False, True])
@@ -448,6 +448,17 @@ def test_a_filters_belief_is_the_state_the_same_when_learning_and_acting():
     np.testing.assert_array_equal(data.observations[1, :, 4], np.arange(1.0, 14.0))
     np.testing.assert_array_equal(data.observations[1, :, :3], agent.trials[1].observations[0])
     np.testing.assert_allclose(data.observations[1, 1:, 3], data.actions[1, :, 0], atol=1e-6)
+
+
+def test_a_new_episode_begins_with_the_filters_first_belief_and_no_action():
+    agent = small(
+        filter=Remembers(), cost=lambda x, u: (x**2).sum(-1) + u[..., 0] ** 2, target=(np.zeros(5), [0.5])
+    )
+    seen = np.array([[0.8, 0.6, 1.0], [1.0, 0.0, 2.0]])
+    state = None
+    for t in range(4):
+        _, state = agent.predict(seen, state, np.array([t == 0, t in (0, 3)]))
+    np.testing.assert_array_equal(state.belief, [[*seen[0], 0.5, 4.0], [*seen[1], 0.0, 1.0]])
 
 
 @quiet

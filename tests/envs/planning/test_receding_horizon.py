@@ -193,6 +193,31 @@ def test_between_plans_the_plan_is_tracked_by_its_gains() -> None:
     assert not np.array_equal(memory.actions[0], actions)
 
 
+def test_the_rest_of_the_old_plan_and_then_nothing_is_the_next_ones_first_guess(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    policy = swing_up(every=3, iterations=8, horizon=20, terminal_cost=lambda s: 50.0 * (s * s).sum(-1))
+    memory, nowhere = policy.begin(1), np.zeros(1, dtype=bool)
+    for _ in range(3):
+        policy.act(STARTS[1:2], memory, ~memory.planned)
+    states, actions, gains = memory.states.copy(), memory.actions.copy(), memory.gains.copy()
+    assert abs(actions[0, -1, 0]) > 0.1, "the old plan acts to its end"
+    given: list[Any] = []
+    solve = ILQR.solve
+
+    def noted(self: ILQR, *arguments: Any, **how: Any) -> Any:
+        given.append(arguments)
+        return solve(self, *arguments, **how)
+
+    monkeypatch.setattr(ILQR, "solve", noted)
+    policy.act(STARTS[1:2], memory, nowhere)
+    ((_, guess, feedback, reference),) = given
+    np.testing.assert_array_equal(guess[:, :17], actions[:, 3:])
+    np.testing.assert_array_equal(guess[:, 17:], 0.0)
+    np.testing.assert_array_equal(feedback[:, :17], gains[:, 3:])
+    np.testing.assert_array_equal(reference[:, :17], states[:, 3:20])
+
+
 def test_a_plan_of_one_episode_is_followed_to_its_end_and_made_anew_there() -> None:
     policy = swing_up(every=99, horizon=6, hold=2, iterations=3)
     memory, state = policy.begin(1), STARTS[2:3]
