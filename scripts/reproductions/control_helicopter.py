@@ -39,7 +39,6 @@ TRIAL_STEPS, TEST_STEPS = 50, 400
 TEST_TRIALS, TUNING_TRIALS, TEST_SEED = 100, 30, 1_000_000
 TUNING_SEEDS = (100, 101, 102)
 FACTOR = 1.2  # of the expert's cost: the target
-STABLE = 2.0  # of the expert's cost: what still counts as hovering
 EXPLORATIONS: dict[str, dict[str, Any]] = {  # std as a share of the greatest change, 0.3 of a stick a step
     "random": {"kind": "random", "std": 0.5, "restoring": 0.5},
     "expert": {"kind": "expert", "std": 0.1},
@@ -128,25 +127,34 @@ def run(request: Request) -> Report:
             "chosen": {_line(*key): value for key, value in chosen.items()},
         },
         figures=FIGURES if len(costs) == len(lines) else {},
-        notes=[*NOTES, _stable(costs, expert)],
+        notes=NOTES,
     )
 
 
 NOTES = [
-    "Costs are means of the summed stage cost over 100 fresh starts of 400 steps; `ours` is the geometric mean over "
-    "all iterations, with its 95 % interval over seeds, `last iteration` the mean over seeds with its standard error, "
-    "`against the expert` that over the expert's cost on the same starts with its 95 % interval. `within 1.2 after` "
-    "gives the transitions of the data when the mean over seeds first came, and from there stayed, within 1.2 times "
-    "the expert's; at random exploration `meets` asks whether there is one.",
+    "Costs are means of the summed stage cost over 100 fresh starts of 400 steps; `ours` is the geometric mean "
+    "over all iterations, with its 95 % interval over seeds, `last iteration` the mean over seeds with its "
+    "standard error, `against the expert` that over the expert's cost on the same starts with its 95 % interval. "
+    "`within 1.2 after` gives the transitions of the data when the mean over seeds first came, and from there "
+    "stayed, within 1.2 times the expert's; at random exploration `meets` asks that there is one and that the "
+    "interval at the last iteration lies below 1.2.",
     "A comparison's `ours` is the ratio of geometric means, paired over seeds: the first named over the second.",
-    "Random exploration must suit an action that is a change of the stick: white noise on it is a random walk of the "
-    "stick. Here each action takes back half of the sum of those before it. The regulator goes to the trim state, "
-    "which is where a trial starts up to its position; at the cost's own minimum the sticks are free, and random "
-    "features far from all data have no slope to go by.",
-    "Deviations: trials of 50 steps, so that an iteration has 100 transitions in two halves; the thesis's initial data "
-    "also had one random trial beside the expert's, here the expert has noise of 0.03 on its actions. Exploration and "
-    "DaD's rollout length were chosen by a few tries on tuning seeds 100 to 102. Of the committed ten seeds five were "
-    "run first, and five more after a look at them, with nothing else changed.",
+    "Random exploration must suit an action that is a change of the stick: white noise on it is a random walk of "
+    "the stick. Here each action takes back half of the sum of those before it. The regulator goes to the trim "
+    "state, which is where a trial starts up to its position; at the cost's own minimum the sticks are free, and "
+    "random features far from all data have no slope to go by.",
+    "Deviations: trials of 50 steps, so that an iteration has 100 transitions in two halves; the thesis's initial"
+    " data also had one random trial beside the expert's, here the expert has noise of 0.03 on its actions. "
+    "Exploration was chosen by about 70 short runs on tuning seeds 100 to 102, nearly all without DaD; DaD's "
+    "rollouts have 5 steps. Of the ten seeds five were run first, and five more after a look at them, with "
+    "nothing else changed.",
+    "What weakens the comparison of DaD with DAgger only: tuning had 3 seeds, and its starts are the first 30 of "
+    "the 100 test starts; with random exploration it gave random Fourier features another ridge in each arm "
+    "(DAgger only 1e-5, DaD 1e-4, the grid's largest). A check afterwards, with other starts and seeds 200 to "
+    "209, at the same ridge in both arms: at 1e-4 the last policy costs 1.22 times the expert's without DaD "
+    "(median 1.08) and 2.53 with it (median 1.13); over all iterations DaD / DAgger only is 1.57 [0.95, 2.60]. So"
+    " the lead of DaD with random Fourier features and random exploration in this table and its figures comes "
+    "from the ridge, not from DaD, and is withdrawn; the linear model's had the same ridge in both arms.",
 ]
 
 
@@ -283,7 +291,9 @@ def _row(line: str, runs: list[dict[str, Any]], expert: float, n: int) -> Row:
         "last iteration": f"{mean[-1]:,.0f} ± {error[-1]:,.0f}",
         "against the expert": ratio.text(".2f"),
         "within 1.2 after": f"{transitions[first]:.0f} (iteration {first + 1})" if reached else "not reached",
-        "meets": reached if "random exploration" in line or line in ACCELERATION else None,
+        "meets": bool(reached and ratio.high < FACTOR)
+        if "random exploration" in line or line in ACCELERATION
+        else None,
         "values": {
             "geometric_mean": geometric.to_dict(),
             "ratio": ratio.to_dict(),
@@ -372,20 +382,6 @@ def _draw(
         references={title: {"1.2 times the expert": FACTOR * expert} for title in panels},
         colours=colours,
         normalise="no",
-    )
-
-
-def _stable(costs: dict[str, NDArray[np.float64]], expert: float) -> str:
-    """How many seeds end with a policy that hovers, arm by arm."""
-    told = []
-    for dad in (False, True):
-        line = costs.get(_line("rff", dad, "random"))
-        if line is not None:
-            near = int(np.count_nonzero(line[:, -1] < STABLE * expert))
-            told.append(f"{near} of {len(line)} seeds with {NAMES[dad]}, the worst {line[:, -1].max():,.0f}")
-    return (
-        f"From random exploration with random Fourier features the last policy costs less than {STABLE:g} times the "
-        f"expert's in {'; '.join(told)}."
     )
 
 
