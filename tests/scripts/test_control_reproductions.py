@@ -50,6 +50,21 @@ def test_settings_are_chosen_on_the_tuning_seeds_and_gains_are_paired(tmp_path):
     assert len(list((tmp_path / "cells" / "control-fake").glob("tuning-*.json"))) == 3 * 2 + 3 * 2 * 2
 
 
+def unlike_cell(cell, extra):
+    """The arms are tuned to different settings, and with DaD's DAgger only costs the same."""
+    best = 3.0 if cell["dad"] else 1.0
+    level = abs(cell["settings"]["alpha"] - best) if cell["seed"] >= 100 else 10.0 - cell["settings"]["alpha"]
+    return {"test_costs": [level + 1.0] * cell["iterations"]}
+
+
+def test_a_gain_that_comes_from_other_settings_is_shown_to(tmp_path):
+    comparison = Comparison(**{**_comparison().__dict__, "function": f"{__name__}:unlike_cell"})
+    (unlike, alike), _, _ = comparison.run(Request(0, 3, 1, tmp_path, told=lambda text: None))
+    assert unlike["values"]["gain"]["value"] == pytest.approx(20.0)
+    assert alike["what"].endswith("DAgger only with DaD's settings")
+    assert alike["values"]["gain"]["value"] == pytest.approx(0.0)
+
+
 def test_a_panel_whose_runs_fail_is_a_row_with_the_reason(tmp_path):
     comparison = _comparison()
     comparison = Comparison(**{**comparison.__dict__, "function": f"{__name__}:failing_cell"})
