@@ -521,7 +521,7 @@ def test_a_cost_of_ones_own_serves_an_env_of_another_package():
         ({"env": "beliefgym/PendulumPosition-v0"}, ValueError, r"\['angular_velocity'\] is not there"),
         ({"env": "beliefgym/CartPoleBalance-v0"}, ValueError, "SystemIdentification needs a flat Box space"),
     ],
-    ids=str,
+    ids=lambda one: ", ".join(one) if isinstance(one, dict) else getattr(one, "__name__", str(one)),
 )
 def test_what_cannot_work_is_told(how, error, told):
     with pytest.raises(error, match=told):

@@ -63,7 +63,7 @@ def fitted(regressor, n_targets=2):
     [(Ridge(), linear_predict), (Ridge(fit_intercept=False), linear_predict)]
     + [(one, polynomial_predict) for one in POLYNOMIALS]
     + [(one, fourier_predict) for one in FOURIERS],
-    ids=str,
+    ids=lambda one: getattr(one, "__name__", str(one)),
 )
 def test_a_regressors_jacobian_is_autograds_of_the_same_sum(regressor, predict):
     model, X = fitted(regressor)
@@ -143,7 +143,7 @@ REGRESSORS = [
         {"standardise": False, "target": "next"},
         {"standardise": False, "angles": (0,)},
     ],
-    ids=str,
+    ids=lambda one: getattr(one, "__name__", str(one)),
 )
 def test_a_models_derivatives_are_those_of_differences_of_its_predictions(regressor, how):
     train = trajectories()
