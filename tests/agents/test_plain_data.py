@@ -80,7 +80,9 @@ def test_objects_that_are_no_plain_data_are_handed_through():
     assert from_plain({"no": "class"}) == {"no": "class"}
 
 
-@pytest.mark.parametrize("value", [Foreign(), ForeignSettings(), np.sin, object(), {"a": 1}], ids=str)
+@pytest.mark.parametrize(
+    "value", [Foreign(), ForeignSettings(), np.sin, object(), {"a": 1}], ids=lambda one: type(one).__name__
+)
 def test_what_a_file_could_not_be_read_back_from_is_not_written(value):
     with pytest.raises(ValueError, match="the agent can be used, but not saved"):
         to_plain(value)
