@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 class Filter(BaseEstimator, ABC):
-    """Base of the filters: `fit(train, validation)`, then `initial_belief`, `update`, `predict_observation`, `forecast`.
+    """Base of the filters: `fit`, then `initial_belief`, `update`, `predict_observation`, `forecast`.
 
     A subclass has the parameter `standardise` and implements `fit`, which begins with `_begin`, and `_initial`,
     `_update` and `_observe` in standardised observations. It may set `_bound` (belief_size,): components of a belief
@@ -54,7 +54,7 @@ class Filter(BaseEstimator, ABC):
 
     @abstractmethod
     def _update(self, belief: Array, z: Array) -> Array:
-        """The next belief: (n, belief_size) and a standardised observation (n, n_obs) -> (n, belief_size); no checks."""
+        """The next belief: (n, belief_size) and standardised observations (n, n_obs) -> (n, belief_size); no checks."""
 
     @abstractmethod
     def _observe(self, belief: Array) -> Array:
@@ -145,7 +145,7 @@ class Filter(BaseEstimator, ABC):
             sequences: trajectories. horizon: observations ahead at each step, at least 1.
         """
         z = self._standardised(sequences)
-        n, n_rows, n_obs = z.shape
+        n, n_rows, _ = z.shape
         squared = np.full((n, n_rows, horizon), np.nan)
         belief = self.initial_belief(n)
         for t in range(n_rows):
