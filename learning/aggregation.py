@@ -43,6 +43,9 @@ class Learner(Protocol):
     def add(self, code: Code, Y: Array) -> None:
         """Add pairs; the model stays as it is until `refit`."""
 
+    def discount(self, factor: float) -> None:
+        """Weigh all that is in the aggregate by a factor in (0, 1]."""
+
     def refit(self) -> None:
         """Bring the model up to the aggregate."""
 
@@ -102,6 +105,10 @@ class SufficientStatistics:
         self._regressor.equations_.add(code, Y)
         self.n_pairs += len(code)
 
+    def discount(self, factor: float) -> None:
+        """Of the sums."""
+        self._regressor.equations_.discount(factor)
+
     def refit(self) -> None:
         """One Cholesky solve."""
         self._regressor.solve()
@@ -149,6 +156,13 @@ class StoredAggregate:
             self._inputs.append(code)
             self._targets.append(Y)
             self.n_pairs += len(code)
+
+    def discount(self, factor: float) -> None:
+        """Not here."""
+        raise TypeError(
+            "expected a regressor linear in features (Ridge, RandomFourierRidge, PolynomialRidge) with discount "
+            f"{factor:g}, got {type(self._prototype).__name__}"
+        )
 
     def refit(self) -> None:
         """Fit a clone to the whole aggregate."""
@@ -213,6 +227,9 @@ class GradientSteps:
         self._weights -= step * (code.T @ residual / len(code) + self._alpha * self._weights)
         if self._regressor.fit_intercept:
             self._offset = self._offset - step * residual.mean(axis=0)
+
+    def discount(self, factor: float) -> None:
+        """Nothing: gradient steps hold no aggregate."""
 
     def refit(self) -> None:
         """Take the stepped coefficients for the next predictions."""

@@ -79,6 +79,12 @@ class NormalEquations:
         self.weight += total
         self.n_rows += len(features)
 
+    def discount(self, factor: float) -> None:
+        """Weigh all that was added by a factor above 0: exponential forgetting, where it is called again and again."""
+        for sums in (self._gram, self._cross, self._sum_z, self._sum_y, self._square_y):
+            sums *= factor
+        self.weight *= factor
+
     def copy(self) -> NormalEquations:
         """An independent copy."""
         other = NormalEquations.__new__(NormalEquations)

@@ -1,0 +1,156 @@
+"""`PredictiveStateFilter`: filters whose belief is the expectation of features of the next k observations.
+
+    m_t = E[phi(f_t) | x_0 .. x_{t-1}],     f_t = [x_t, .., x_{t+k-1}],     m_0 = mean of phi(f_0)       (Eq. 3.16)
+
+With phi_1 a belief is a forecast: its first block is x_hat_t, its last one x_hat_{t+k-1}. Further ahead than that, the
+filter takes its own predictions for the observations that come.
+
+Reference: thesis proposal, Secs. 3.3.1 to 3.3.3. Eqs. 3.19 and 3.23 print the mean over trajectories i = 1 .. M as
+1/T sum_i^T phi(f_i^i); it is 1/M sum_i^M phi(f_1^i), as in Algorithm 3, line 2.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beliefgym.learning.filters import Filter, check_whole
+from beliefgym.learning.future_features import (
+    Features,
+    FutureFeatures,
+    OwnFeatures,
+    SecondMoments,
+    future_features,
+)
+from beliefgym.learning.sequences import Sequences
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+
+class PredictiveStateFilter(Filter):
+    """Base of the predictive state filters; a subclass has the parameters below, and implements `fit` and `_update`.
+
+    Args of every subclass:
+        n_future: k.
+        features: "first" (phi_1), "second" (phi_2) or a function of standardised futures (n, k, n_obs) -> (n, d).
+        standardise: True each component by its own standard deviation, "together" all by one number, False not.
+        belief_limit: bound of a belief's components, as a multiple of the training features' largest.
+    """
+
+    n_future: int
+    features: Features
+    belief_limit: float
+
+    def predict_variance(self, belief: ArrayLike) -> Array:
+        """Variance of the next observation, (n, belief_size) -> (n, n_obs), in squared units.
+
+        Raises:
+            ValueError: a belief without second moments.
+        """
+        b = self._checked_belief(belief)
+        if not isinstance(self._phi, SecondMoments):
+            raise ValueError(
+                "expected features='second', whose beliefs hold second moments, got a belief without"
+            )
+        return self._phi.read_variance(self._state(b))[:, 0] * np.square(self._scale.scale)
+
+    def _begin_predictive(self, train: Sequences, validation: Sequences | None) -> tuple[Array, Counts]:
+        """Coordinates, features, the initial belief and the bounds, from the training data.
+
+        Returns:
+            As `_targets`.
+
+        Raises:
+            ValueError: parameters out of range; not one trajectory of k + 1 observations.
+        """
+        check_whole("n_future", self.n_future, 1)
+        if not self.belief_limit > 0:
+            raise ValueError(f"expected belief_limit above 0, got {self.belief_limit!r}")
+        self._begin(train, validation)
+        z, n_targets = self._scale.apply(train.observations), self._n_targets(train)
+        short = n_targets < 2
+        if short.any():
+            warnings.warn(
+                f"{short.sum()} of {len(train)} trajectories have fewer than n_future + 1 = {self.n_future + 1} "
+                f"observations: nothing is learned from them",
+                stacklevel=3,
+            )
+        futures = cut_futures(z, self.n_future)
+        complete = np.arange(futures.shape[1]) < n_targets[:, None]
+        self._phi: FutureFeatures = future_features(self.features, futures[complete])
+        targets, n_targets = self._targets(train)
+        self._first_belief = targets[n_targets > 0, 0].mean(axis=0)
+        largest = np.abs(targets).max(axis=(0, 1))
+        self._bound = self.belief_limit * np.where(largest > 0, largest, 1.0)
+        return targets, n_targets
+
+    def _targets(self, sequences: Sequences) -> tuple[Array, Counts]:
+        """phi(f_t) of every t.
+
+        Returns:
+            (n_episodes, n_steps + 1, size), 0 where f_t is not complete, and (n_episodes,) for how many t it is.
+        """
+        n_targets = self._n_targets(sequences)
+        z = self._scale.apply(sequences.observations)
+        futures = cut_futures(z, self.n_future)
+        complete = np.arange(futures.shape[1]) < n_targets[:, None]
+        targets = np.zeros((*z.shape[:2], self._phi.size))
+        targets[:, : futures.shape[1]][complete] = self._phi(futures[complete])
+        return targets, n_targets
+
+    def _n_targets(self, sequences: Sequences) -> Counts:
+        """(n_episodes,) times at which k observations are still to come."""
+        n_targets: Counts = np.maximum(sequences.lengths + 2 - self.n_future, 0)
+        if not (n_targets > 1).any():
+            raise ValueError(
+                f"expected a trajectory of at least n_future + 1 = {self.n_future + 1} observations, got "
+                f"{len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower n_future"
+            )
+        return n_targets
+
+    def _initial(self) -> Array:
+        return self._first_belief
+
+    @property
+    def belief_size(self) -> int:
+        """Features of the future."""
+        self._check_fitted()
+        return self._phi.size
+
+    def _state(self, belief: Array) -> Array:
+        """E[phi] of a belief: (n, belief_size) -> (n, size)."""
+        return belief
+
+    def _observe(self, belief: Array) -> Array:
+        return self._phi.read_next(self._state(belief))
+
+    def _forecast(self, belief: Array, horizon: int) -> Array:
+        k = self.n_future
+        predicted = np.empty((len(belief), horizon, self.n_obs_))
+        predicted[:, :k] = self._phi.read(self._state(belief))[:, :horizon]
+        for step in range(k, horizon):
+            belief = self._advance(belief, self._observe(belief))
+            predicted[:, step] = self._phi.read_last(self._state(belief))
+        return predicted
+
+    def _learn_to_read(self, beliefs: Array, z: Array, n_targets: Counts) -> None:
+        """Where the features are the user's, learn to read observations off beliefs.
+
+        Args:
+            beliefs: (n, n_rows, size), m_t of each t. z: (n, n_rows, n_obs). n_targets: (n,) complete futures.
+        """
+        if isinstance(self._phi, OwnFeatures):
+            futures = cut_futures(z, self.n_future)
+            complete = np.arange(futures.shape[1]) < n_targets[:, None]
+            self._phi.learn_to_read(beliefs[:, : futures.shape[1]][complete], futures[complete])
+
+
+def cut_futures(z: Array, k: int) -> Array:
+    """f_t of every t at which the padded arrays hold k rows: (n, n_rows, d) -> (n, max(n_rows - k + 1, 0), k, d)."""
+    n, n_rows, d = z.shape
+    if n_rows < k:
+        return np.empty((n, 0, k, d))
+    return np.moveaxis(np.lib.stride_tricks.sliding_window_view(z, k, axis=1), 3, 2)

@@ -1,0 +1,400 @@
+"""`PSIM`: Predictive State Inference Machines, filters trained as predictors of future observations.
+
+Filtering is one function, m_{t+1} = F(m_t, x_t), of the predictive state m_t = E[phi(f_t) | h_{t-1}] and the latest
+observation. It is learned by regression of phi(f_{t+1}) on the inputs (m_t, x_t) that the filter itself meets: the
+present hypothesis F_n filters every training trajectory, the pairs join the aggregate, and F_{n+1} is fitted to it,
+
+    D <- D + {((m_t^{F_n}, x_t), phi(f_{t+1}))}_{t, i},     F_{n+1} = argmin_F  sum_D |F(m, x) - phi(f)|^2,
+
+n = 0 .. N. The hypothesis with the lowest filter error on validation trajectories is returned.
+
+Two things are done differently, because hypotheses that diverge on the way otherwise spoil the aggregate for good (at
+worst the error doubled on recorded data): beliefs are kept within bounds, and nothing is learned from one that had to
+be; and the aggregate starts with the pairs that F_0 was fitted to (see `init`), not empty.
+
+References: thesis proposal, Algorithm 4 (Sec. 3.3.3), Eqs. 3.21 to 3.23; Sun, Venkatraman, Boots & Bagnell, "Learning
+to filter with predictive state inference machines", ICML 2016.
+"""
+
+from __future__ import annotations
+
+import time
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator
+from tqdm import tqdm
+
+from beliefgym.learning.aggregation import Algorithm, Learner, learner_for, predict_unchecked
+from beliefgym.learning.dynamics import Standardise
+from beliefgym.learning.filters import check_whole
+from beliefgym.learning.future_features import Features
+from beliefgym.learning.linear_in_features import Ridge
+from beliefgym.learning.predictive_state import PredictiveStateFilter
+from beliefgym.learning.sequences import Sequences
+
+Array = NDArray[np.float64]
+Init = Literal["history", "teacher", "prior"]
+BUFFERED = 2**22  # numbers of features that are kept before they go into the aggregate (32 MiB)
+HISTORY_RIDGE = 1e-6  # a sample; of the regression on the past
+HISTORY = (
+    "iteration",
+    "train_error",
+    "validation_error",
+    "aggregate_error",
+    "n_pairs",
+    "n_bounded",
+    "seconds",
+)
+
+
+class PSIM(PredictiveStateFilter):
+    """A stationary filter trained by dataset aggregation (Algorithm 4).
+
+    With `Ridge` it is the thesis's PSIM-Linear_d, with `RandomFourierRidge(include_inputs=True)` its PSIM-RFF_d.
+
+    Args:
+        regressor: learns F; any scikit-learn regressor. Those of this package that are linear in features keep
+            sufficient statistics instead of the aggregate. None for `Ridge()`.
+        n_future: k, observations in a predictive state.
+        features: "first" for phi_1 (Eq. 3.32), "second" for phi_2 (Eq. 3.33), or a function of futures (n, k, n_obs),
+            standardised -> (n, d).
+        n_iterations: N, at least 1.
+        init: F_0, which the algorithm leaves open. "history" regresses phi(f_{t+1}) on (m~_t, x_t), with m~_t the
+            regression of phi(f_t) on the last n_past observations, as in the first stage of two-stage regression, and
+            these pairs start the aggregate; "teacher" takes phi(f_t) itself for m~_t, which holds the very
+            observations to be predicted, so that these pairs do not; "prior" always answers m_0.
+        n_past: observations of that history; None for 2 n_future.
+        discount: weight of the aggregate against the next iteration's pairs, in (0, 1]; 1 is the algorithm. Below 1
+            what weak first hypotheses met is forgotten; a regressor linear in features is needed then.
+        algorithm: "follow_the_leader" or "online_gradient", see `DataAsDemonstrator`.
+        step_size: of "online_gradient".
+        standardise: bring components to one scale: True each by its own standard deviation, "together" all by one
+            number (components of one unit), False not. Errors of the history are in these units.
+        belief_limit: bound of a belief's components, as a multiple of the training features' largest.
+        progress_bar: show the iterations.
+
+    Attributes:
+        model_: the chosen F, a regressor of (m_t, x_t), standardised. best_iteration_: n of the chosen F_n.
+        history_: arrays (N + 1,): "train_error" and "validation_error" (mean squared error of the next observation,
+            standardised, summed over components), "aggregate_error" (of F_n on what it was fitted to, root mean
+            square over all features), "n_pairs" in the aggregate it was fitted to, "n_bounded" beliefs that left
+            their bounds in training, "seconds".
+
+    Example:
+        >>> filter = PSIM(RandomFourierRidge(include_inputs=True, random_state=0), n_future=5)  # doctest: +SKIP
+        >>> filter.fit(train, validation).errors(test).mean  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        regressor: BaseEstimator | None = None,
+        *,
+        n_future: int = 5,
+        features: Features = "first",
+        n_iterations: int = 20,
+        init: Init = "history",
+        n_past: int | None = None,
+        discount: float = 1.0,
+        algorithm: Algorithm = "follow_the_leader",
+        step_size: float = 0.1,
+        standardise: Standardise = True,
+        belief_limit: float = 3.0,
+        progress_bar: bool = False,
+    ) -> None:
+        self.regressor = regressor
+        self.n_future = n_future
+        self.features = features
+        self.n_iterations = n_iterations
+        self.init = init
+        self.n_past = n_past
+        self.discount = discount
+        self.algorithm = algorithm
+        self.step_size = step_size
+        self.standardise = standardise
+        self.belief_limit = belief_limit
+        self.progress_bar = progress_bar
+
+    def fit(self, train: Sequences, validation: Sequences | None = None) -> Self:
+        """Run N iterations and keep the filter that predicts the validation trajectories best, one step ahead.
+
+        Args:
+            train: trajectories; those of fewer than n_future + 1 observations are left out, and told.
+            validation: whole trajectories. Without them the error in training chooses.
+
+        Raises:
+            ValueError: no trajectory long enough, other components in validation, parameters out of range.
+            TypeError: not `Sequences`.
+        """
+        self._check_parameters()
+        data = self._training_data(train, validation)
+        regressor = Ridge() if self.regressor is None else self.regressor
+        self._told_divergence = True  # hypotheses on the way may leave the bounds; the history counts it
+        self.history_: dict[str, Array] = {name: np.full(self.n_iterations + 1, np.nan) for name in HISTORY}
+        started = time.perf_counter()
+        self.model_: Any
+        self.model_, first_pairs = self._first_hypothesis(regressor, data)
+        learner: Learner | None = None
+        best = np.inf
+        for n in tqdm(range(self.n_iterations + 1), desc=type(self).__name__, disable=not self.progress_bar):
+            if learner is not None:
+                self.model_ = learner.frozen()
+                self._note(n, n_pairs=learner.n_pairs, aggregate_error=learner.mean_squared_error() ** 0.5)
+            pairs = Pairs(learner if n < self.n_iterations else None)
+            if learner is not None and self.discount < 1:
+                learner.discount(self.discount)
+            beliefs, n_bounded = self._filter(data, pairs)
+            self._learn_to_read(beliefs, data.z, data.n_targets)
+            self._note(n, iteration=n, n_bounded=n_bounded, train_error=self._next_error(beliefs, data))
+            if validation is not None:
+                self._note(n, validation_error=self._validation_error(validation))
+            criterion = self.history_["train_error" if validation is None else "validation_error"][n]
+            if criterion < best or n == 0:
+                best, self.best_iteration_, chosen = criterion, n, (self.model_, copy(self._phi))
+            if learner is None:
+                inputs, targets = (np.concatenate(b) for b in zip(first_pairs, pairs.all(), strict=True))
+                learner = learner_for(regressor, self.algorithm, inputs, targets, self.step_size)
+            elif n < self.n_iterations:
+                learner.refit()
+            self._note(n, seconds=time.perf_counter() - started)
+            started = time.perf_counter()
+        self.model_, self._phi = chosen
+        self._learner = learner
+        self._told_divergence = False
+        return self
+
+    def partial_fit(self, train: Sequences) -> Self:
+        """Go on learning from new trajectories: one iteration of Algorithm 4 on them, on top of the aggregate.
+
+        The present filter goes over them, what it meets joins the aggregate of `fit`, and the next hypothesis is
+        fitted to all of it: follow the leader, whose regret against the best fixed filter grows more slowly than the
+        number of calls. Coordinates, features and initial belief stay those of `fit`.
+
+        Args:
+            train: trajectories of at least n_future + 1 observations.
+
+        Raises:
+            NotFittedError, ValueError: not fitted; loaded from a file, which holds no aggregate; too short.
+        """
+        self._check_fitted()
+        learner = self._held_learner()
+        self._filter(self._more_data(train), Pairs(learner))
+        learner.refit()
+        self.model_ = learner.frozen()
+        return self
+
+    def _update(self, belief: Array, z: Array) -> Array:
+        return predict_unchecked(self.model_, self._inputs(belief, z), self._phi.size)
+
+    def _inputs(self, belief: Array, z: Array) -> Array:
+        """(m_t, x_t) side by side: (n, size) and (n, n_obs) -> (n, size + n_obs)."""
+        n, size = belief.shape
+        inputs = np.empty((n, size + z.shape[1]))
+        inputs[:, :size] = belief
+        inputs[:, size:] = z
+        return inputs
+
+    def _training_data(self, train: Sequences, validation: Sequences | None) -> TrainingData:
+        targets, n_targets = self._begin_predictive(train, validation)
+        return TrainingData(self._scale.apply(train.observations), train.lengths, targets, n_targets)
+
+    def _more_data(self, train: Sequences) -> TrainingData:
+        targets, n_targets = self._targets(train)
+        return TrainingData(self._standardised(train), train.lengths, targets, n_targets)
+
+    def _first_hypothesis(self, regressor: Any, data: TrainingData) -> tuple[Any, tuple[Array, Array]]:
+        """F_0, and the pairs that start the aggregate."""
+        n_inputs, size = data.z.shape[2] + data.targets.shape[2], data.targets.shape[2]
+        nothing = np.empty((0, n_inputs)), np.empty((0, size))
+        if self.init == "prior":
+            return Constant(self._first_belief), nothing
+        episode, t = np.nonzero(data.is_learnt)
+        if self.init == "teacher":
+            state = data.targets[episode, t]
+        else:
+            past = past_windows(data.z, 2 * self.n_future if self.n_past is None else self.n_past)
+            known = np.nonzero(np.arange(data.targets.shape[1]) < data.n_targets[:, None])
+            state_of_past = Ridge(alpha=HISTORY_RIDGE).fit(past[known], data.targets[known])
+            state = state_of_past.predict_unchecked(past[episode, t])
+        pairs = self._inputs(state, data.z[episode, t]), data.targets[episode, t + 1]
+        hypothesis = learner_for(regressor, "follow_the_leader", *pairs).frozen()
+        return hypothesis, pairs if self.init == "history" else nothing
+
+    def _filter(self, data: TrainingData, pairs: Pairs) -> tuple[Array, int]:
+        """The present filter over all trajectories at once, one step of time after the other.
+
+        Args:
+            data: the trajectories. pairs: are given ((m_t, x_t), phi(f_{t+1})) wherever that is complete.
+
+        Returns:
+            Beliefs m_t (n_episodes, n_steps + 1, size), and how many were outside their bounds.
+        """
+        z, bound = data.z, self._bound
+        assert bound is not None
+        n, n_rows, _ = z.shape
+        beliefs = np.empty((n, n_rows, self._phi.size))
+        beliefs[:, 0] = self._first_belief
+        n_bounded = 0
+        learnt = data.is_learnt
+        for t in range(n_rows - 1):
+            going = np.flatnonzero(data.lengths > t)
+            if not len(going):
+                break
+            rows = slice(None) if len(going) == n else going
+            inputs = self._inputs(beliefs[rows, t], z[rows, t])
+            following = pairs.met(inputs, data.targets[rows, t + 1], learnt[rows, t], self.model_)
+            outside = ~(np.abs(following) <= bound)
+            if outside.any():
+                left = outside.any(axis=1)
+                n_bounded += int(np.count_nonzero(left))
+                learnt[going[left], t + 1] = False
+                following = np.where(np.isnan(following), inputs[:, : self._phi.size], following)
+                following = np.clip(following, -bound, bound)
+            beliefs[rows, t + 1] = following
+        pairs.flush()
+        return beliefs, n_bounded
+
+    def _next_error(self, beliefs: Array, data: TrainingData) -> float:
+        """Mean over trajectories of the mean over t >= 1 of |x_hat_t - x_t|^2, standardised."""
+        n, n_rows, size = beliefs.shape
+        predicted = self._observe(beliefs.reshape(-1, size)).reshape(n, n_rows, -1)
+        return mean_next_error(predicted, data.z, data.lengths)
+
+    def _validation_error(self, validation: Sequences) -> float:
+        data = TrainingData.to_filter(self._standardised(validation), validation.lengths, self._phi.size)
+        return self._next_error(self._filter(data, Pairs(None))[0], data)
+
+    def _note(self, n: int, **values: float) -> None:
+        for name, value in values.items():
+            self.history_[name][n] = value
+
+    def _check_parameters(self) -> None:
+        check_whole("n_iterations", self.n_iterations, 1)
+        if self.n_past is not None:
+            check_whole("n_past", self.n_past, 1)
+        if not 0 < self.discount <= 1:
+            raise ValueError(f"expected discount in (0, 1], got {self.discount!r}")
+        if self.init not in get_args(Init):
+            raise ValueError(f"expected init to be one of {get_args(Init)}, got {self.init!r}")
+
+    def _held_learner(self) -> Learner:
+        learner: Learner | None = getattr(self, "_learner", None)
+        if learner is None:
+            raise ValueError(
+                "expected a PSIM that still holds its aggregate, got one from a file, which only filters; fit anew"
+            )
+        return learner
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Trajectories as a filter learns from them.
+
+    Attributes:
+        z: (n, n_rows, n_obs) standardised. lengths: (n,) steps.
+        targets: (n, n_rows, size) phi(f_t), 0 where f_t is not complete. n_targets: (n,) those that are.
+    """
+
+    z: Array
+    lengths: NDArray[np.int64]
+    targets: Array
+    n_targets: NDArray[np.int64]
+
+    @classmethod
+    def to_filter(cls, z: Array, lengths: NDArray[np.int64], size: int) -> TrainingData:
+        """Nothing to learn from."""
+        nothing = np.broadcast_to(0.0, (*z.shape[:2], size))
+        return cls(z, lengths, nothing, np.zeros(len(z), dtype=np.int64))
+
+    @property
+    def is_learnt(self) -> NDArray[np.bool_]:
+        """(n, n_rows) whether (m_t, x_t) has a target, phi(f_{t+1})."""
+        return np.arange(self.z.shape[1]) + 1 < self.n_targets[:, None]
+
+
+class Pairs:
+    """Predicts, and hands the inputs met and their targets to a learner, many at once; without one it keeps them.
+
+    Args:
+        learner: whose present model predicts; it encodes inputs once for both uses. None keeps pairs, for `all`.
+    """
+
+    def __init__(self, learner: Learner | None) -> None:
+        self._learner = learner
+        self._inputs: list[Array] = []
+        self._targets: list[Array] = []
+        self._n = 0
+
+    def met(self, inputs: Array, targets: Array, learnt: NDArray[np.bool_], model: Any) -> Array:
+        """Predict the next beliefs.
+
+        Args:
+            inputs: (n, n_inputs). targets: (n, size). learnt: (n,) which have a target.
+            model: predicts where there is no learner.
+
+        Returns:
+            (n, size).
+        """
+        if self._learner is None:
+            code, predicted = inputs, predict_unchecked(model, inputs, targets.shape[1])
+        else:
+            code = self._learner.encode(inputs)
+            predicted = self._learner.predict(code)
+        if learnt.any():
+            everyone = bool(learnt.all())
+            self._inputs.append(code if everyone else code[learnt])
+            self._targets.append(targets if everyone else targets[learnt])
+            self._n += len(self._targets[-1])
+            if self._learner is not None and self._n * code.shape[1] >= BUFFERED:
+                self.flush()
+        return predicted
+
+    def flush(self) -> None:
+        """Hand on what is kept, where there is a learner."""
+        if self._learner is not None and self._n:
+            self._learner.add(*self.all())
+            self._inputs, self._targets, self._n = [], [], 0
+
+    def all(self) -> tuple[Array, Array]:
+        """What is kept: (n, n_inputs) and (n, size)."""
+        return np.concatenate(self._inputs), np.concatenate(self._targets)
+
+
+class Constant:
+    """The hypothesis that answers the same to everything.
+
+    Args:
+        answer: (size,).
+    """
+
+    def __init__(self, answer: Array) -> None:
+        self.answer = answer
+
+    def predict_unchecked(self, X: Array) -> Array:
+        """(n, n_inputs) -> (n, size)."""
+        return np.tile(self.answer, (len(X), 1))
+
+
+def past_windows(z: Array, n_past: int) -> Array:
+    """x_{t-1}, .., x_{t-n_past} before each t, 0 before the start: (n, n_rows, d) -> (n, n_rows, n_past d)."""
+    n, n_rows, d = z.shape
+    past = np.zeros((n, n_rows, n_past, d))
+    for lag in range(1, min(n_past, n_rows - 1) + 1):
+        past[:, lag:, lag - 1] = z[:, : n_rows - lag]
+    return past.reshape(n, n_rows, n_past * d)
+
+
+def mean_next_error(predicted: Array, z: Array, lengths: NDArray[np.int64]) -> float:
+    """Mean over trajectories of 1/T sum_{t=1}^T |x_hat_t - x_t|^2.
+
+    Args:
+        predicted, z: (n, n_rows, n_obs). lengths: (n,) T; those of no step do not count.
+    """
+    t = np.arange(z.shape[1])
+    counts = (t > 0) & (t <= lengths[:, None])
+    squared = np.where(counts, np.square(predicted - z).sum(axis=2), 0.0)
+    used = lengths > 0
+    return float((squared.sum(axis=1)[used] / lengths[used]).mean())
