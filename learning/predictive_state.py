@@ -25,6 +25,7 @@ from beliefgym.learning.future_features import (
     future_features,
 )
 from beliefgym.learning.sequences import Sequences
+from beliefgym.learning.standardisation import Standardisation
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -136,6 +137,21 @@ class PredictiveStateFilter(Filter):
             predicted[:, step] = self._phi.read_last(self._state(belief))
         return predicted
 
+    def _next_error(self, sequences: Sequences) -> float:
+        """The error that the histories hold: see `mean_next_error`."""
+        z = self._standardised(sequences)
+        beliefs = np.empty((*z.shape[:2], self.belief_size))
+        beliefs[:, 0] = self._initial()
+        for t in range(z.shape[1] - 1):
+            beliefs[:, t + 1] = self._advance(beliefs[:, t], z[:, t])
+        return self._error_of(beliefs, z, sequences.lengths)
+
+    def _error_of(self, beliefs: Array, z: Array, lengths: Counts) -> float:
+        """The same, of beliefs (n, n_rows, belief_size) that are there already."""
+        n, n_rows, size = beliefs.shape
+        predicted = self._observe(beliefs.reshape(-1, size)).reshape(n, n_rows, -1)
+        return mean_next_error(predicted, z, lengths)
+
     def _learn_to_read(self, beliefs: Array, z: Array, n_targets: Counts) -> None:
         """Where the features are the user's, learn to read observations off beliefs.
 
@@ -146,6 +162,43 @@ class PredictiveStateFilter(Filter):
             futures = cut_futures(z, self.n_future)
             complete = np.arange(futures.shape[1]) < n_targets[:, None]
             self._phi.learn_to_read(beliefs[:, : futures.shape[1]][complete], futures[complete])
+
+
+class TrainingData:
+    """Trajectories as a predictive state filter learns from them.
+
+    Args:
+        targets, n_targets: of `PredictiveStateFilter._targets`. scale: of the observations.
+        sequences: the trajectories.
+
+    Attributes:
+        z: (n, n_rows, n_obs) standardised. lengths: (n,) steps.
+        targets: (n, n_rows, size) phi(f_t), 0 where f_t is not complete. n_targets: (n,) those that are.
+    """
+
+    def __init__(
+        self, targets: Array, n_targets: Counts, scale: Standardisation, sequences: Sequences
+    ) -> None:
+        self.targets, self.n_targets = targets, n_targets
+        self.z, self.lengths = scale.apply(sequences.observations), sequences.lengths
+
+    @property
+    def is_learnt(self) -> NDArray[np.bool_]:
+        """(n, n_rows) whether (m_t, x_t) has a target, phi(f_{t+1})."""
+        return np.arange(self.z.shape[1]) + 1 < self.n_targets[:, None]
+
+
+def mean_next_error(predicted: Array, z: Array, lengths: Counts) -> float:
+    """Mean over trajectories of 1/T sum_{t=1}^T |x_hat_t - x_t|^2.
+
+    Args:
+        predicted, z: (n, n_rows, n_obs). lengths: (n,) T; those of no step do not count.
+    """
+    t = np.arange(z.shape[1])
+    counts = (t > 0) & (t <= lengths[:, None])
+    squared = np.where(counts, np.square(predicted - z).sum(axis=2), 0.0)
+    used = lengths > 0
+    return float((squared.sum(axis=1)[used] / lengths[used]).mean())
 
 
 def cut_futures(z: Array, k: int) -> Array:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import time
 from copy import copy
-from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -32,8 +31,8 @@ from beliefgym.learning.aggregation import Algorithm, Learner, learner_for, pred
 from beliefgym.learning.dynamics import Standardise
 from beliefgym.learning.filters import check_whole
 from beliefgym.learning.future_features import Features
-from beliefgym.learning.linear_in_features import Ridge
-from beliefgym.learning.predictive_state import PredictiveStateFilter
+from beliefgym.learning.linear_in_features import LinearInFeatures, Ridge
+from beliefgym.learning.predictive_state import PredictiveStateFilter, TrainingData
 from beliefgym.learning.sequences import Sequences
 
 Array = NDArray[np.float64]
@@ -130,7 +129,7 @@ class PSIM(PredictiveStateFilter):
             TypeError: not `Sequences`.
         """
         self._check_parameters()
-        data = self._training_data(train, validation)
+        data = TrainingData(*self._begin_predictive(train, validation), self._scale, train)
         regressor = Ridge() if self.regressor is None else self.regressor
         self._told_divergence = True  # hypotheses on the way may leave the bounds; the history counts it
         self.history_: dict[str, Array] = {name: np.full(self.n_iterations + 1, np.nan) for name in HISTORY}
@@ -148,9 +147,11 @@ class PSIM(PredictiveStateFilter):
                 learner.discount(self.discount)
             beliefs, n_bounded = self._filter(data, pairs)
             self._learn_to_read(beliefs, data.z, data.n_targets)
-            self._note(n, iteration=n, n_bounded=n_bounded, train_error=self._next_error(beliefs, data))
+            self._note(
+                n, iteration=n, n_bounded=n_bounded, train_error=self._error_of(beliefs, data.z, data.lengths)
+            )
             if validation is not None:
-                self._note(n, validation_error=self._validation_error(validation))
+                self._note(n, validation_error=self._next_error(validation))
             criterion = self.history_["train_error" if validation is None else "validation_error"][n]
             if criterion < best or n == 0:
                 best, self.best_iteration_, chosen = criterion, n, (self.model_, copy(self._phi))
@@ -181,10 +182,31 @@ class PSIM(PredictiveStateFilter):
         """
         self._check_fitted()
         learner = self._held_learner()
-        self._filter(self._more_data(train), Pairs(learner))
+        self._standardised(train)
+        self._filter(TrainingData(*self._targets(train), self._scale, train), Pairs(learner))
         learner.refit()
         self.model_ = learner.frozen()
         return self
+
+    @property
+    def past_length(self) -> int:
+        """Observations of the history that F_0 sees."""
+        return 2 * self.n_future if self.n_past is None else self.n_past
+
+    def chosen(self) -> LinearInFeatures:
+        """The chosen filter's regressor as a copy that goes on learning, with the aggregate's sums.
+
+        Raises:
+            NotFittedError, ValueError, TypeError: not fitted; from a file; not linear in features.
+        """
+        self._check_fitted()
+        held = getattr(self._held_learner(), "_regressor", None)
+        if not isinstance(held, LinearInFeatures) or not isinstance(self.model_, LinearInFeatures):
+            raise TypeError(f"expected a PSIM linear in features, got one of {type(self.model_).__name__}")
+        regressor = held.frozen()
+        regressor.equations_ = held.equations_.copy()
+        regressor._set(self.model_._weights, self.model_._offset)
+        return regressor
 
     def _update(self, belief: Array, z: Array) -> Array:
         return predict_unchecked(self.model_, self._inputs(belief, z), self._phi.size)
@@ -197,29 +219,17 @@ class PSIM(PredictiveStateFilter):
         inputs[:, size:] = z
         return inputs
 
-    def _training_data(self, train: Sequences, validation: Sequences | None) -> TrainingData:
-        targets, n_targets = self._begin_predictive(train, validation)
-        return TrainingData(self._scale.apply(train.observations), train.lengths, targets, n_targets)
-
-    def _more_data(self, train: Sequences) -> TrainingData:
-        targets, n_targets = self._targets(train)
-        return TrainingData(self._standardised(train), train.lengths, targets, n_targets)
-
     def _first_hypothesis(self, regressor: Any, data: TrainingData) -> tuple[Any, tuple[Array, Array]]:
         """F_0, and the pairs that start the aggregate."""
         n_inputs, size = data.z.shape[2] + data.targets.shape[2], data.targets.shape[2]
         nothing = np.empty((0, n_inputs)), np.empty((0, size))
         if self.init == "prior":
             return Constant(self._first_belief), nothing
-        episode, t = np.nonzero(data.is_learnt)
         if self.init == "teacher":
-            state = data.targets[episode, t]
+            episode, t = np.nonzero(data.is_learnt)
+            pairs = self._inputs(data.targets[episode, t], data.z[episode, t]), data.targets[episode, t + 1]
         else:
-            past = past_windows(data.z, 2 * self.n_future if self.n_past is None else self.n_past)
-            known = np.nonzero(np.arange(data.targets.shape[1]) < data.n_targets[:, None])
-            state_of_past = Ridge(alpha=HISTORY_RIDGE).fit(past[known], data.targets[known])
-            state = state_of_past.predict_unchecked(past[episode, t])
-        pairs = self._inputs(state, data.z[episode, t]), data.targets[episode, t + 1]
+            pairs = history_pairs(data, self.past_length)
         hypothesis = learner_for(regressor, "follow_the_leader", *pairs).frozen()
         return hypothesis, pairs if self.init == "history" else nothing
 
@@ -257,16 +267,6 @@ class PSIM(PredictiveStateFilter):
         pairs.flush()
         return beliefs, n_bounded
 
-    def _next_error(self, beliefs: Array, data: TrainingData) -> float:
-        """Mean over trajectories of the mean over t >= 1 of |x_hat_t - x_t|^2, standardised."""
-        n, n_rows, size = beliefs.shape
-        predicted = self._observe(beliefs.reshape(-1, size)).reshape(n, n_rows, -1)
-        return mean_next_error(predicted, data.z, data.lengths)
-
-    def _validation_error(self, validation: Sequences) -> float:
-        data = TrainingData.to_filter(self._standardised(validation), validation.lengths, self._phi.size)
-        return self._next_error(self._filter(data, Pairs(None))[0], data)
-
     def _note(self, n: int, **values: float) -> None:
         for name, value in values.items():
             self.history_[name][n] = value
@@ -287,32 +287,6 @@ class PSIM(PredictiveStateFilter):
                 "expected a PSIM that still holds its aggregate, got one from a file, which only filters; fit anew"
             )
         return learner
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingData:
-    """Trajectories as a filter learns from them.
-
-    Attributes:
-        z: (n, n_rows, n_obs) standardised. lengths: (n,) steps.
-        targets: (n, n_rows, size) phi(f_t), 0 where f_t is not complete. n_targets: (n,) those that are.
-    """
-
-    z: Array
-    lengths: NDArray[np.int64]
-    targets: Array
-    n_targets: NDArray[np.int64]
-
-    @classmethod
-    def to_filter(cls, z: Array, lengths: NDArray[np.int64], size: int) -> TrainingData:
-        """Nothing to learn from."""
-        nothing = np.broadcast_to(0.0, (*z.shape[:2], size))
-        return cls(z, lengths, nothing, np.zeros(len(z), dtype=np.int64))
-
-    @property
-    def is_learnt(self) -> NDArray[np.bool_]:
-        """(n, n_rows) whether (m_t, x_t) has a target, phi(f_{t+1})."""
-        return np.arange(self.z.shape[1]) + 1 < self.n_targets[:, None]
 
 
 class Pairs:
@@ -378,6 +352,20 @@ class Constant:
         return np.tile(self.answer, (len(X), 1))
 
 
+def history_pairs(data: TrainingData, n_past: int) -> tuple[Array, Array]:
+    """Inputs (m~_t, x_t) and targets phi(f_{t+1}), with m~_t the regression of phi(f_t) on the past.
+
+    Returns:
+        (n, size + n_obs) and (n, size).
+    """
+    past = past_windows(data.z, n_past)
+    known = np.nonzero(np.arange(data.targets.shape[1]) < data.n_targets[:, None])
+    state_of_past = Ridge(alpha=HISTORY_RIDGE).fit(past[known], data.targets[known])
+    episode, t = np.nonzero(data.is_learnt)
+    state = state_of_past.predict_unchecked(past[episode, t])
+    return np.concatenate([state, data.z[episode, t]], axis=1), data.targets[episode, t + 1]
+
+
 def past_windows(z: Array, n_past: int) -> Array:
     """x_{t-1}, .., x_{t-n_past} before each t, 0 before the start: (n, n_rows, d) -> (n, n_rows, n_past d)."""
     n, n_rows, d = z.shape
@@ -385,16 +373,3 @@ def past_windows(z: Array, n_past: int) -> Array:
     for lag in range(1, min(n_past, n_rows - 1) + 1):
         past[:, lag:, lag - 1] = z[:, : n_rows - lag]
     return past.reshape(n, n_rows, n_past * d)
-
-
-def mean_next_error(predicted: Array, z: Array, lengths: NDArray[np.int64]) -> float:
-    """Mean over trajectories of 1/T sum_{t=1}^T |x_hat_t - x_t|^2.
-
-    Args:
-        predicted, z: (n, n_rows, n_obs). lengths: (n,) T; those of no step do not count.
-    """
-    t = np.arange(z.shape[1])
-    counts = (t > 0) & (t <= lengths[:, None])
-    squared = np.where(counts, np.square(predicted - z).sum(axis=2), 0.0)
-    used = lengths > 0
-    return float((squared.sum(axis=1)[used] / lengths[used]).mean())
