@@ -1,13 +1,14 @@
 """`BackpropPSIM`: the filter of `PSIM` trained by back-propagation through time, from random starts or after DAgger.
 
-    min_{A, b}  1/n sum_{i, t} |m_{t+1} - phi(f_{t+1})|^2 + alpha |A|^2,     m_{t+1} = A' psi(m_t, x_t) + b    (Eq. 3.21)
+    min_{A, b}  1/n sum_{i, t} |m_{t+1} - phi(f_{t+1})|^2 + alpha |A|^2,    m_{t+1} = A' psi(m_t, x_t) + b   (Eq. 3.21)
 
 for filters linear in features psi (`Ridge`, `RandomFourierRidge`), by Adam on mini-batches of whole trajectories. With
 init "random" these are the thesis's PSIM-Linear_b and PSIM-RFF_b, with "dagger" its PSIM-Linear_d+b.
 
 What only depends on observations is computed for all steps at once, so that a step of a linear filter is one product.
 As in `BackpropThroughTime`, Adam walks in whitened features and along a cosine of step sizes, and gradients are
-clipped; the thesis names none of that, and without it random starts come out worse than they need to.
+clipped; the thesis names none of that, and without it random starts come out worse than they need to. Directions of
+little variance are whitened in part only: a recurrent filter is soon unstable along them.
 
 Reference: thesis proposal, Eqs. 3.21 to 3.23, Tables 3.2 and 3.3 (Sec. 3.3).
 """
@@ -38,6 +39,8 @@ Array = NDArray[np.float64]
 Init = Literal["random", "dagger"]
 Loss = Literal["state", "observation"]
 HISTORY = ("epoch", "loss", "validation_error", "seconds")
+LEARNING_RATES: dict[Init, float] = {"random": 1e-2, "dagger": 3e-4}
+DAMPING = 1e-2  # added to the variances that whitening divides by, as a share of the largest
 
 
 class BackpropPSIM(PredictiveStateFilter):
@@ -50,7 +53,8 @@ class BackpropPSIM(PredictiveStateFilter):
         loss: "state" for all features of the future (Eq. 3.21), "observation" for the next observation alone.
         n_epochs: passes over the training trajectories, at least 0.
         batch_size: trajectories in a mini-batch.
-        learning_rate: of Adam, at the start; it falls to 0 along a cosine.
+        learning_rate: of Adam, at the start; it falls to 0 along a cosine. None for 1e-2 from random starts, 3e-4 after
+            DAgger.
         truncation: steps that a gradient goes back; None for whole trajectories.
         max_gradient_norm: gradients are shortened to it; None leaves them.
         random_state: of the start and the mini-batches.
@@ -73,7 +77,7 @@ class BackpropPSIM(PredictiveStateFilter):
         loss: Loss = "state",
         n_epochs: int = 100,
         batch_size: int = 16,
-        learning_rate: float = 1e-2,
+        learning_rate: float | None = None,
         truncation: int | None = None,
         max_gradient_norm: float | None = 1.0,
         random_state: int | np.random.Generator | None = None,
@@ -123,7 +127,7 @@ class BackpropPSIM(PredictiveStateFilter):
             losses: list[float] = []
             order = rng.permutation(trajectories) if epoch else trajectories[:0]
             for i in range(0, len(order), self.batch_size):
-                rate = 0.5 * self.learning_rate * (1.0 + np.cos(np.pi * update / n_updates))
+                rate = 0.5 * self._first_rate * (1.0 + np.cos(np.pi * update / n_updates))
                 losses.append(walk.step(order[i : i + self.batch_size], rate))
                 update += 1
             weights, offset = walk.coefficients()
@@ -163,10 +167,14 @@ class BackpropPSIM(PredictiveStateFilter):
         )
         return regressor
 
+    @property
+    def _first_rate(self) -> float:
+        return LEARNING_RATES[self.init] if self.learning_rate is None else self.learning_rate
+
     def _tell_divergence(self, epoch: int) -> None:
         warnings.warn(
             f"training diverged in epoch {epoch} of {self.n_epochs} and was ended; the best filter, of epoch "
-            f"{self.best_epoch_}, is kept. A learning_rate below {self.learning_rate:g} may help",
+            f"{self.best_epoch_}, is kept. A learning_rate below {self._first_rate:g} may help",
             DivergenceWarning,
             stacklevel=3,
         )
@@ -182,8 +190,8 @@ class BackpropPSIM(PredictiveStateFilter):
         check_whole("batch_size", self.batch_size, 1)
         if self.truncation is not None:
             check_whole("truncation", self.truncation, 1)
-        if not self.learning_rate > 0:
-            raise ValueError(f"expected learning_rate above 0, got {self.learning_rate!r}")
+        if self.learning_rate is not None and not self.learning_rate > 0:
+            raise ValueError(f"expected learning_rate above 0 or None, got {self.learning_rate!r}")
         if self.max_gradient_norm is not None and not self.max_gradient_norm > 0:
             raise ValueError(f"expected max_gradient_norm above 0 or None, got {self.max_gradient_norm!r}")
         for name, kinds in (("init", get_args(Init)), ("loss", get_args(Loss))):
@@ -257,7 +265,7 @@ class Walk:
     """
 
     def __init__(self, model: BackpropPSIM, regressor: LinearInFeatures, loss: LossThroughTime) -> None:
-        parameters = Parameters(regressor, whiten=True)
+        parameters = Parameters(regressor, whiten=True, damping=DAMPING)
         parameters.set(regressor._weights, regressor._offset)
         self._theta = _tensor(parameters.theta, model.device).requires_grad_()
         self._from_theta = _tensor(parameters._from_theta, model.device)

@@ -239,9 +239,10 @@ class Parameters:
     Args:
         regressor: fitted; its sums give the features' mean and covariance.
         whiten: whether P whitens the features; otherwise P is the identity and the mean 0.
+        damping: added to the variances that whitening divides by, as a share of the largest.
     """
 
-    def __init__(self, regressor: LinearInFeatures, whiten: bool) -> None:
+    def __init__(self, regressor: LinearInFeatures, whiten: bool, damping: float = DAMPING) -> None:
         m, d = regressor._weights.shape
         mean, covariance = feature_moments(regressor.equations_)
         self.variance = float(np.trace(covariance) + mean @ mean)  # mean of |phi|^2
@@ -252,7 +253,7 @@ class Parameters:
                 covariance = covariance + np.outer(mean, mean)
             values, vectors = np.linalg.eigh(covariance)
             deviation = np.sqrt(
-                np.maximum(values, 0.0) + regressor.alpha + DAMPING * max(values[-1], DAMPING)
+                np.maximum(values, 0.0) + regressor.alpha + damping * max(values[-1], DAMPING)
             )
             self._from_theta, self._to_theta = vectors / deviation, (vectors * deviation).T
         else:
