@@ -27,6 +27,8 @@ REPRODUCTIONS = {
     "control-helicopter": "beliefgym.scripts.reproductions.control_helicopter:run",
     "control-base": "beliefgym.scripts.reproductions.control_base:run",
     "control-arm": "beliefgym.scripts.reproductions.control_arm:run",
+    "psim-synthetic": "beliefgym.scripts.reproductions.psim_synthetic:run",
+    "psim-recorded": "beliefgym.scripts.reproductions.psim_recorded:run",
 }
 
 

@@ -1,0 +1,161 @@
+"""The recorded data of the filter experiments, in ten folds: the thesis's Sec. 3.3.4 on public recordings.
+
+Every fold has a test part, the next fold as its validation part, and the other eight to train on. What belongs together
+is held out together: a subject's tracks, a block of a video's time, the near replicates among the assembly trials.
+Whatever is fitted to the data (scales, principal components) is fitted to the training part.
+
+- assembly: a robot snaps a camera part together; wrist wrench (N, N m) and joint angles (rad), the first 350 samples
+  of the 46 trials that have so many, at 20 Hz. Every component is divided by its standard deviation: units differ.
+- arm: joint angles, velocities and motor torques of an arm in free motion, 81 trajectories of 350 steps at 250 Hz;
+  divided in the same way.
+- mocap: walking, 59 tracks of 14 subjects, 300 steps at 120 Hz; joints but fingers and thumbs, relative to the root's
+  place on the floor, in cm, as 10 principal components (the thesis takes those of the first trajectory).
+- pumpjack, fire, flag (simulated): 20 principal components of grey frames of 80 x 60 pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefgym.learning import Sequences
+from beliefgym.learning.dynamics import Standardise
+from beliefgym.learning.splits import fold_indices
+from beliefgym.scripts.reproductions import dad_data
+
+Floats = NDArray[np.float64]
+Parts = tuple[Sequences, Sequences, Sequences]
+VERSION = 1  # of these data; cells made with another one run again
+N_FOLDS = 10
+ASSEMBLY, ARM, MOCAP = "assembly", "arm", "mocap"
+FILES = {
+    ASSEMBLY: "hiro_snap_assembly/hiro_snap_assembly.npz",
+    ARM: "schunk_arm/schunk_arm.npz",
+    MOCAP: "cmu_walk/cmu_walk.npz",
+    "pumpjack": dad_data.CLIPS["pumpjack"],
+    "fire": dad_data.CLIPS["fireplace"],
+}
+N_STEPS = 349  # of an assembly trial: 350 observations, as in the thesis
+REPLICATES = [f"SA-S-{i:02d}" for i in range(2, 22)]  # assembly trials that repeat within 0.0003 rad
+N_BODY, CM = 10, 100.0  # components of a pose; centimetres in a metre
+FINGERS = ("fingers", "thumb")
+CLIP_STEPS = 18  # a recorded clip's eleven blocks of time have some 20 frames each
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How a data set enters the experiments.
+
+    Attributes:
+        title: in tables. seed_column: its column in Table 3.3, or "".
+        n_future: k, as in the thesis: 5, and 3 for videos.
+        standardise: of the filters: components of one unit are scaled together.
+        unit: of the squared errors.
+    """
+
+    title: str
+    thesis_column: str
+    n_future: int
+    standardise: Standardise
+    unit: str
+
+    @property
+    def is_video(self) -> bool:
+        """Whether it is one."""
+        return self.n_future == 3
+
+
+RECORDINGS = {
+    ASSEMBLY: Recording("assembly telemetry", "Robot Drill", 5, True, "standard deviations squared"),
+    ARM: Recording("arm torques", "Robot Drill", 5, True, "standard deviations squared"),
+    MOCAP: Recording("motion capture", "Motion Cap.", 5, "together", "cm^2"),
+    "pumpjack": Recording("pumpjack video", "Beach Video", 3, "together", "grey levels squared"),
+    "fire": Recording("fire video", "Beach Video", 3, "together", "grey levels squared"),
+    "flag": Recording("flag video (simulated)", "Flag Video", 3, "together", "grey levels squared"),
+}
+
+
+def present(name: str, folder: Path | None) -> bool:
+    """Whether the folder of recorded data holds what this one needs; the flag is simulated."""
+    return name == "flag" or (folder is not None and (folder / FILES[name]).exists())
+
+
+def parts(name: str, fold: int, paths: dict[str, Any]) -> Parts:
+    """Training, validation and test part.
+
+    Args:
+        name: of `RECORDINGS`. fold: 0 .. 9.
+        paths: "data", folder of the recordings, and "flag", file of the simulated frames.
+    """
+    if RECORDINGS[name].is_video:
+        return _video(name, fold, paths)
+    with np.load(Path(paths["data"]) / FILES[name]) as file:
+        arrays = {key: file[key] for key in file}
+    observations = arrays["observations"].astype(float)
+    if name == MOCAP:
+        subjects = np.array([track.split("_")[0] for track in arrays["track"]])
+        return _poses(observations, [str(joint) for joint in arrays["joints"]], subjects, fold)
+    if name == ASSEMBLY:
+        long = arrays["lengths"] > N_STEPS
+        observations, groups = observations[long, : N_STEPS + 1], np.arange(np.count_nonzero(long))
+        groups[is_replicate(arrays["trial"][long])] = -1
+    else:
+        groups = np.arange(len(observations))
+    names = [str(component) for component in arrays["names"]]
+    train, validation, test = split(len(groups), fold, groups)
+    rows = observations[train].reshape(-1, observations.shape[2])
+    scaled = (observations - rows.mean(axis=0)) / rows.std(axis=0)
+
+    def part(chosen: NDArray[np.int64]) -> Sequences:
+        return Sequences.from_observations(scaled[chosen], observation_names=names)
+
+    return part(train), part(validation), part(test)
+
+
+def is_replicate(trials: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """(n,) which assembly trials are near replicates of one another."""
+    return np.array([any(str(trial).endswith(name) for name in REPLICATES) for trial in trials])
+
+
+def split(n: int, fold: int, groups: NDArray[Any]) -> tuple[NDArray[np.int64], ...]:
+    """Indices to train, to validate and to test on."""
+    tests = [test for _, test in fold_indices(n, N_FOLDS, 0, groups)]
+    test, validation = tests[fold], tests[(fold + 1) % N_FOLDS]
+    train = np.setdiff1d(np.arange(n), np.concatenate([test, validation]))
+    return train, validation, test
+
+
+def _poses(positions: Floats, joints: list[str], subjects: NDArray[np.str_], fold: int) -> Parts:
+    """Principal components of poses; y is up, so the root's x and z go."""
+    n, n_rows, _ = positions.shape
+    body = CM * positions.reshape(n, n_rows, len(joints), 3)
+    floor = body[:, :, joints.index("root")] * np.array([1.0, 0.0, 1.0])
+    kept = [i for i, joint in enumerate(joints) if not joint.endswith(FINGERS)]
+    pose = (body[:, :, kept] - floor[:, :, None]).reshape(n, n_rows, -1)
+    train, validation, test = split(n, fold, subjects)
+    rows = pose[train].reshape(-1, pose.shape[2])
+    centred = rows - rows.mean(axis=0)
+    directions = np.linalg.eigh(centred.T @ centred)[1][:, ::-1][:, :N_BODY]
+    components = (pose - rows.mean(axis=0)) @ directions
+    names = [f"pc_{i}" for i in range(N_BODY)]
+
+    def part(chosen: NDArray[np.int64]) -> Sequences:
+        return Sequences.from_observations(components[chosen], observation_names=names)
+
+    return part(train), part(validation), part(test)
+
+
+def _video(name: str, fold: int, paths: dict[str, Any]) -> Parts:
+    """Blocks of a video's time: eleven, of which one to test on and the next to validate on."""
+    if name == "flag":
+        with np.load(paths["flag"]) as file:
+            frames = file["frames"]
+        cut = (dad_data.FLAG_EVERY, dad_data.FLAG_STEPS, dad_data.FLAG_STRIDE)
+    else:
+        frames = dad_data.clip_frames({"fire": "fireplace"}.get(name, name), Path(paths["data"]))
+        cut = (1, CLIP_STEPS, 1)
+    return dad_data.video_parts(frames, fold, N_FOLDS, *cut)[0]

@@ -1,0 +1,278 @@
+"""The filters of Table 3.3 and their grids: every one tuned on the same validation trajectories, by the same error.
+
+A method is a grid of settings; each is fitted to the training part, the one with the lowest one-step error on the
+validation part is taken, and the test part is looked at once, by that one. Filters that choose among ranks or
+iterations inside `fit` do it on the same validation part. Random features are screened with few iterations.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from sklearn.exceptions import ConvergenceWarning
+
+from beliefgym.learning import Sequences
+from beliefgym.learning.autoregressive_filter import AutoregressiveFilter
+from beliefgym.learning.dynamics import DivergenceWarning
+from beliefgym.learning.filters import Filter
+from beliefgym.learning.instrumental_regression import InstrumentalVariableRegression
+from beliefgym.learning.kalman_filter import KalmanFilter
+from beliefgym.learning.linear_in_features import Ridge
+from beliefgym.learning.psim import PSIM
+from beliefgym.learning.random_fourier import RandomFourierRidge
+from beliefgym.learning.subspace_identification import N4SID
+from beliefgym.scripts.reproductions.psim_data import Recording
+
+VERSION = 1  # of the grids; cells made with another one run again
+ALPHAS = (1e-8, 1e-6, 1e-4, 1e-2, 1e-1, 1.0)  # a sample, standardised
+BANDWIDTHS = (0.5, 1.0, 2.0)  # times the square root of the number of inputs
+WAVES, SCREENING = 300, 3  # random frequencies; iterations of the settings that are only screened
+N_ITERATIONS = 20  # of DAgger, as in the thesis
+HORIZON = 10  # observations ahead in Fig. 3.20
+RANKS = (2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50)
+STATES = {True: (10, 20), False: (10, 20)}  # of the Kalman filters
+EM_ITERATIONS = 50
+RANDOM_EPOCHS, FINE_EPOCHS = 100, 30  # of back-propagation from random starts, and after DAgger
+RANDOM_RATES, FINE_RATES = (3e-3, 1e-2), (1e-4, 3e-4)
+WAVES_B, WAVES_EPOCHS = 100, 60  # of back-propagation with random features, which costs the most
+SIZES = (64, 128)  # of recurrent networks
+Settings = list[dict[str, Any]]
+Make = Callable[..., Filter]
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What a method came to.
+
+    Attributes:
+        filter: the chosen one. setting: its. validation: its one-step error there.
+        seconds: of its own fit. seconds_tuning: of all fits.
+    """
+
+    filter: Filter
+    setting: dict[str, Any]
+    validation: float
+    seconds: float
+    seconds_tuning: float
+
+
+def tuned(make: Make, settings: Settings, train: Sequences, validation: Sequences) -> Tuned:
+    """Fit every setting and take the best."""
+    started = time.perf_counter()
+    best: Tuned | None = None
+    for setting in settings:
+        began = time.perf_counter()
+        fitted = make(**setting).fit(train, validation)
+        seconds = time.perf_counter() - began
+        error = fitted.errors(validation).mean
+        if best is None or error < best.validation:
+            best = Tuned(fitted, setting, float(error), seconds, 0.0)
+    if best is None:
+        raise ValueError("expected at least one setting")
+    return Tuned(best.filter, best.setting, best.validation, best.seconds, time.perf_counter() - started)
+
+
+def linear_group(
+    recording: Recording, parts: tuple[Sequences, Sequences], seed: int
+) -> Iterator[tuple[str, Tuned]]:
+    """Everything that is linear or a closed form."""
+    k, scaled = recording.n_future, recording.standardise
+    ridges: Settings = [{"alpha": alpha} for alpha in ALPHAS]
+
+    def autoregressive(n_past: int) -> Make:
+        return lambda alpha: AutoregressiveFilter(Ridge(alpha=alpha), n_past=n_past, standardise=scaled)
+
+    def psim(**options: Any) -> Make:
+        return lambda alpha: PSIM(
+            Ridge(alpha=alpha),
+            **{"n_future": k, "standardise": scaled, "n_iterations": N_ITERATIONS, **options},
+        )
+
+    yield "AR-5", tuned(autoregressive(5), ridges, *parts)
+    yield "AR-10", tuned(autoregressive(10), ridges, *parts)
+    yield (
+        "N4SID",
+        tuned(
+            lambda i: N4SID(n_states=None, n_block_rows=i, standardise=scaled),
+            [{"i": i} for i in ((2, 3) if recording.is_video else (5, 10))],
+            *parts,
+        ),
+    )
+    yield (
+        "IVR",
+        tuned(
+            lambda: InstrumentalVariableRegression(
+                n_future=k, rank=[r for r in RANKS if r <= k * parts[0].n_obs], standardise=scaled
+            ),
+            [{}],
+            *parts,
+        ),
+    )
+    yield "PSIM-Linear_d", tuned(psim(), ridges, *parts)
+    yield "PSIM-Linear_d, k = 1", tuned(psim(n_future=1), ridges, *parts)
+    yield "PSIM-Linear_d, phi_2", tuned(psim(features="second"), ridges, *parts)
+
+
+def waves_group(
+    recording: Recording, parts: tuple[Sequences, Sequences], seed: int
+) -> Iterator[tuple[str, Tuned]]:
+    """Random Fourier features, in an autoregression and in PSIM."""
+    k, scaled, n_obs = recording.n_future, recording.standardise, parts[0].n_obs
+
+    def waves(n_inputs: int, bandwidth: float, alpha: float) -> RandomFourierRidge:
+        return RandomFourierRidge(
+            n_frequencies=WAVES,
+            bandwidth=bandwidth * n_inputs**0.5,
+            alpha=alpha,
+            include_inputs=True,
+            random_state=seed,
+        )
+
+    alphas = ALPHAS[2:] if recording.is_video else ALPHAS[:4]  # videos have few frames, and much that is new
+    grid: Settings = [{"bandwidth": b, "alpha": a} for b, a in product(BANDWIDTHS, alphas)]
+    yield (
+        "AR-5, RFF",
+        tuned(
+            lambda bandwidth, alpha: AutoregressiveFilter(
+                waves(5 * n_obs, bandwidth, alpha), n_past=5, standardise=scaled
+            ),
+            grid,
+            *parts,
+        ),
+    )
+    for name, n_future in (("PSIM-RFF_d", k), ("PSIM-RFF_d, k = 1", 1)):
+        started = time.perf_counter()
+
+        def psim(bandwidth: float, alpha: float, n_iterations: int, n_future: int = n_future) -> PSIM:
+            regressor = waves((n_future + 1) * n_obs, bandwidth, alpha)
+            return PSIM(regressor, n_future=n_future, standardise=scaled, n_iterations=n_iterations)
+
+        screened = tuned(psim, [{**one, "n_iterations": SCREENING} for one in grid], *parts)
+        final = tuned(psim, [{**screened.setting, "n_iterations": N_ITERATIONS}], *parts)
+        seconds = time.perf_counter() - started
+        yield name, Tuned(final.filter, final.setting, final.validation, final.seconds, seconds)
+
+
+def kalman_group(
+    recording: Recording, parts: tuple[Sequences, Sequences], seed: int
+) -> Iterator[tuple[str, Tuned]]:
+    """Kalman filters learned by expectation maximisation."""
+    for name, method in (("Kalman, EM", "em"), ("Kalman, MAP", "map")):
+        yield (
+            name,
+            tuned(
+                lambda n_states, method=method: KalmanFilter(
+                    n_states=n_states,
+                    method=method,
+                    n_iterations=EM_ITERATIONS,
+                    standardise=recording.standardise,
+                    random_state=seed,
+                ),
+                [{"n_states": n} for n in STATES[recording.is_video]],
+                *parts,
+            ),
+        )
+
+
+def gradient_group(
+    recording: Recording, parts: tuple[Sequences, Sequences], seed: int
+) -> Iterator[tuple[str, Tuned]]:
+    """PSIM by back-propagation through time; the ridge is that of DAgger's choice."""
+    from beliefgym.learning.psim_backprop import BackpropPSIM
+
+    k, scaled = recording.n_future, recording.standardise
+    common: dict[str, Any] = {"n_future": k, "standardise": scaled, "n_iterations": N_ITERATIONS}
+    dagger = tuned(
+        lambda alpha: PSIM(Ridge(alpha=alpha), **common), [{"alpha": alpha} for alpha in ALPHAS], *parts
+    )
+    linear = PSIM(Ridge(**dagger.setting), **common)
+    n_epochs = (
+        RANDOM_EPOCHS // 4 if recording.thesis_column == "Flag Video" else RANDOM_EPOCHS
+    )  # 1200 windows
+
+    def trained(psim: PSIM, init: Any, n_epochs: int) -> Make:
+        return lambda learning_rate: BackpropPSIM(
+            psim, init=init, n_epochs=n_epochs, learning_rate=learning_rate, random_state=seed
+        )
+
+    random, fine = ([{"learning_rate": rate} for rate in rates] for rates in (RANDOM_RATES, FINE_RATES))
+    yield "PSIM-Linear_b", tuned(trained(linear, "random", n_epochs), random, *parts)
+    yield "PSIM-Linear_d+b", tuned(trained(linear, "dagger", FINE_EPOCHS), fine, *parts)
+    waves = RandomFourierRidge(
+        n_frequencies=WAVES_B,
+        bandwidth=((k + 1) * parts[0].n_obs) ** 0.5,
+        alpha=dagger.setting["alpha"],
+        include_inputs=True,
+        random_state=seed,
+    )
+    yield (
+        "PSIM-RFF_b",
+        tuned(
+            trained(PSIM(waves, **common), "random", n_epochs * WAVES_EPOCHS // RANDOM_EPOCHS),
+            random[1:],
+            *parts,
+        ),
+    )
+
+
+def recurrent_group(
+    recording: Recording, parts: tuple[Sequences, Sequences], seed: int
+) -> Iterator[tuple[str, Tuned]]:
+    """Recurrent networks."""
+    from beliefgym.learning.recurrent_filter import GRUFilter, LSTMFilter
+
+    for name, network in (("GRU", GRUFilter), ("LSTM", LSTMFilter)):
+        yield (
+            name,
+            tuned(
+                lambda hidden_size, network=network: network(
+                    hidden_size=hidden_size, standardise=recording.standardise, random_state=seed
+                ),
+                [{"hidden_size": size} for size in SIZES],
+                *parts,
+            ),
+        )
+
+
+GROUPS = {
+    "linear": linear_group,
+    "waves": waves_group,
+    "kalman": kalman_group,
+    "gradient": gradient_group,
+    "recurrent": recurrent_group,
+}
+
+
+def results(
+    group: str, recording: Recording, train: Sequences, validation: Sequences, test: Sequences, seed: int
+) -> dict[str, Any]:
+    """Tune every method of a group, and look at the test part."""
+    found: dict[str, Any] = {}
+    with warnings.catch_warnings():
+        for kind in (DivergenceWarning, ConvergenceWarning):
+            warnings.simplefilter("ignore", kind)
+        for name, one in GROUPS[group](recording, (train, validation), seed):
+            errors = one.filter.errors(test, min(HORIZON, test.n_steps))
+            found[name] = {
+                "test": errors.mean,
+                "by_episode": errors.by_episode.tolist(),
+                "by_look_ahead": errors.by_look_ahead.tolist(),
+                "by_time": errors.by_time.tolist(),
+                "power": errors.power,
+                "validation": one.validation,
+                "setting": one.setting,
+                "best_iteration": int(
+                    getattr(one.filter, "best_iteration_", getattr(one.filter, "best_epoch_", 0))
+                ),
+                "belief_size": one.filter.belief_size,
+                "seconds": one.seconds,
+                "seconds_tuning": one.seconds_tuning,
+            }
+    last = float(np.square(np.diff(test.observations, axis=1)[test.step_mask]).sum(axis=1).mean())
+    return {"methods": found, "last_value": last, "n_train": train.n_transitions, "n_test": len(test)}
