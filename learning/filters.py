@@ -211,13 +211,15 @@ class Filter(BaseEstimator, ABC):
             )
 
     def _standardised(self, sequences: Sequences) -> Array:
-        """(n_episodes, n_steps + 1, n_obs)."""
+        """(n_episodes, n_steps + 1, n_obs), 0 past an episode's end, where nothing is to take a belief out of its bounds."""
         self._check_fitted()
         if sequences.n_obs != self.n_obs_:
             raise ValueError(
                 f"expected trajectories with {self.n_obs_} observations as at fit, got {sequences.n_obs}"
             )
-        return self._scale.apply(sequences.observations)
+        z = self._scale.apply(sequences.observations)
+        z[~sequences.observation_mask] = 0.0
+        return z
 
     def _checked_belief(self, belief: ArrayLike) -> Array:
         self._check_fitted()

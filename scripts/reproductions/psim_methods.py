@@ -2,7 +2,8 @@
 
 A method is a grid of settings; each is fitted to the training part, the one with the lowest one-step error on the
 validation part is taken, and the test part is looked at once, by that one. Filters that choose among ranks or
-iterations inside `fit` do it on the same validation part. Random features are screened with few iterations.
+iterations inside `fit` do it on the same validation part. Settings of random features are screened with a third of the
+features and few iterations.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -32,7 +33,8 @@ from beliefgym.scripts.reproductions.psim_data import Recording
 VERSION = 1  # of the grids; cells made with another one run again
 ALPHAS = (1e-8, 1e-6, 1e-4, 1e-2, 1e-1, 1.0)  # a sample, standardised
 BANDWIDTHS = (0.5, 1.0, 2.0)  # times the square root of the number of inputs
-WAVES, SCREENING = 300, 3  # random frequencies; iterations of the settings that are only screened
+WAVES, SCREENED_WAVES = 300, 100  # random frequencies; of the settings that are only screened
+SCREENING = 3  # iterations of these
 N_ITERATIONS = 20  # of DAgger, as in the thesis
 HORIZON = 10  # observations ahead in Fig. 3.20
 RANKS = (2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50)
@@ -125,9 +127,9 @@ def waves_group(
     """Random Fourier features, in an autoregression and in PSIM."""
     k, scaled, n_obs = recording.n_future, recording.standardise, parts[0].n_obs
 
-    def waves(n_inputs: int, bandwidth: float, alpha: float) -> RandomFourierRidge:
+    def waves(n_inputs: int, n_frequencies: int, bandwidth: float, alpha: float) -> RandomFourierRidge:
         return RandomFourierRidge(
-            n_frequencies=WAVES,
+            n_frequencies=n_frequencies,
             bandwidth=bandwidth * n_inputs**0.5,
             alpha=alpha,
             include_inputs=True,
@@ -136,27 +138,25 @@ def waves_group(
 
     alphas = ALPHAS[2:] if recording.is_video else ALPHAS[:4]  # videos have few frames, and much that is new
     grid: Settings = [{"bandwidth": b, "alpha": a} for b, a in product(BANDWIDTHS, alphas)]
-    yield (
-        "AR-5, RFF",
-        tuned(
-            lambda bandwidth, alpha: AutoregressiveFilter(
-                waves(5 * n_obs, bandwidth, alpha), n_past=5, standardise=scaled
-            ),
-            grid,
-            *parts,
-        ),
-    )
-    for name, n_future in (("PSIM-RFF_d", k), ("PSIM-RFF_d, k = 1", 1)):
-        started = time.perf_counter()
 
-        def psim(bandwidth: float, alpha: float, n_iterations: int, n_future: int = n_future) -> PSIM:
-            regressor = waves((n_future + 1) * n_obs, bandwidth, alpha)
+    def autoregressive(n_iterations: int, n_frequencies: int, **setting: float) -> Filter:
+        regressor = waves(5 * n_obs, n_frequencies, **setting)
+        return AutoregressiveFilter(regressor, n_past=5, standardise=scaled)
+
+    def psim(n_future: int) -> Make:
+        def make(n_iterations: int, n_frequencies: int, **setting: float) -> Filter:
+            regressor = waves((n_future + 1) * n_obs, n_frequencies, **setting)
             return PSIM(regressor, n_future=n_future, standardise=scaled, n_iterations=n_iterations)
 
-        screened = tuned(psim, [{**one, "n_iterations": SCREENING} for one in grid], *parts)
-        final = tuned(psim, [{**screened.setting, "n_iterations": N_ITERATIONS}], *parts)
-        seconds = time.perf_counter() - started
-        yield name, Tuned(final.filter, final.setting, final.validation, final.seconds, seconds)
+        return make
+
+    makes = {"AR-5, RFF": autoregressive, "PSIM-RFF_d": psim(k), "PSIM-RFF_d, k = 1": psim(1)}
+    for name, make in makes.items():
+        started = time.perf_counter()
+        small = {"n_iterations": SCREENING, "n_frequencies": SCREENED_WAVES}
+        screened = tuned(make, [{**one, **small} for one in grid], *parts).setting
+        full = {**screened, "n_iterations": N_ITERATIONS, "n_frequencies": WAVES}
+        yield name, replace(tuned(make, [full], *parts), seconds_tuning=time.perf_counter() - started)
 
 
 def kalman_group(
@@ -243,9 +243,9 @@ def recurrent_group(
 GROUPS = {
     "linear": linear_group,
     "waves": waves_group,
-    "kalman": kalman_group,
     "gradient": gradient_group,
     "recurrent": recurrent_group,
+    "kalman": kalman_group,
 }
 
 
