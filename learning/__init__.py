@@ -16,6 +16,7 @@ from beliefgym.learning.video_frames import read_frames, split_video
 from beliefgym.learning.windows import Transitions, Windows
 
 if TYPE_CHECKING:
+    from beliefgym.learning.autoregressive_filter import AutoregressiveFilter
     from beliefgym.learning.backprop_through_time import (
         BackpropThroughTime,
         LaggedError,
@@ -24,21 +25,46 @@ if TYPE_CHECKING:
     from beliefgym.learning.data_as_demonstrator import DataAsDemonstrator
     from beliefgym.learning.direct_multi_step import DirectMultiStep
     from beliefgym.learning.dynamics import DivergenceWarning, DynamicsModel
+    from beliefgym.learning.filter_errors import FilterErrors
+    from beliefgym.learning.filter_files import load_filter, save_filter
+    from beliefgym.learning.filters import Filter
+    from beliefgym.learning.instrumental_regression import InstrumentalVariableRegression
+    from beliefgym.learning.kalman_filter import KalmanFilter
+    from beliefgym.learning.linear_gaussian import LinearGaussianSystem
     from beliefgym.learning.linear_in_features import Ridge
     from beliefgym.learning.multi_step_error import MultiStepErrors, multi_step_errors
     from beliefgym.learning.polynomial import PolynomialRidge
+    from beliefgym.learning.psim import PSIM
+    from beliefgym.learning.psim_backprop import BackpropPSIM
+    from beliefgym.learning.psim_forward import ForwardPSIM
+    from beliefgym.learning.psim_stream import LearningStream
     from beliefgym.learning.random_forest import RandomForest
     from beliefgym.learning.random_fourier import RandomFourierRidge
+    from beliefgym.learning.recurrent_filter import GRUFilter, LSTMFilter
     from beliefgym.learning.scheduled_sampling import ScheduledSampling
+    from beliefgym.learning.subspace_identification import N4SID
     from beliefgym.learning.video_textures import VideoTexture
 
 __all__ = [
+    "N4SID",
+    "PSIM",
+    "AutoregressiveFilter",
+    "BackpropPSIM",
     "BackpropThroughTime",
     "DataAsDemonstrator",
     "DirectMultiStep",
     "DivergenceWarning",
     "DynamicsModel",
+    "Filter",
+    "FilterErrors",
+    "ForwardPSIM",
+    "GRUFilter",
+    "InstrumentalVariableRegression",
+    "KalmanFilter",
+    "LSTMFilter",
     "LaggedError",
+    "LearningStream",
+    "LinearGaussianSystem",
     "MultiStepErrors",
     "PolynomialRidge",
     "RandomForest",
@@ -53,9 +79,11 @@ __all__ = [
     "delay_embedding",
     "from_csv",
     "from_minari",
+    "load_filter",
     "load_npz",
     "multi_step_errors",
     "read_frames",
+    "save_filter",
     "save_npz",
     "split_video",
     "to_csv",
@@ -63,13 +91,26 @@ __all__ = [
 ]
 
 _MODULES = {
+    "AutoregressiveFilter": "autoregressive_filter",
+    "BackpropPSIM": "psim_backprop",
     "BackpropThroughTime": "backprop_through_time",
     "DataAsDemonstrator": "data_as_demonstrator",
     "DirectMultiStep": "direct_multi_step",
     "DivergenceWarning": "dynamics",
     "DynamicsModel": "dynamics",
+    "Filter": "filters",
+    "FilterErrors": "filter_errors",
+    "ForwardPSIM": "psim_forward",
+    "GRUFilter": "recurrent_filter",
+    "InstrumentalVariableRegression": "instrumental_regression",
+    "KalmanFilter": "kalman_filter",
+    "LSTMFilter": "recurrent_filter",
     "LaggedError": "backprop_through_time",
+    "LearningStream": "psim_stream",
+    "LinearGaussianSystem": "linear_gaussian",
     "MultiStepErrors": "multi_step_error",
+    "N4SID": "subspace_identification",
+    "PSIM": "psim",
     "PolynomialRidge": "polynomial",
     "RandomForest": "random_forest",
     "RandomFourierRidge": "random_fourier",
@@ -77,7 +118,9 @@ _MODULES = {
     "ScheduledSampling": "scheduled_sampling",
     "VideoTexture": "video_textures",
     "WeightedMultiHorizon": "backprop_through_time",
+    "load_filter": "filter_files",
     "multi_step_errors": "multi_step_error",
+    "save_filter": "filter_files",
 }
 
 

@@ -18,6 +18,7 @@ BENCHMARKS = {
     "env": "beliefgym.scripts.benchmarks.env:run",
     "dad": "beliefgym.scripts.benchmarks.dad:run",
     "control": "beliefgym.scripts.benchmarks.control:run",
+    "filter": "beliefgym.scripts.benchmarks.filter:run",
 }
 
 
@@ -31,7 +32,7 @@ class Benchmark:
     """
 
     name: tyro.conf.Positional[str]
-    """Which: env, dad, control."""
+    """Which: env, dad, control, filter."""
     results: Path = Path("results")
     """Folder; NAME.json and NAME.md are written to its benchmark/."""
 
