@@ -25,6 +25,14 @@ if TYPE_CHECKING:
     from beliefgym.learning.data_as_demonstrator import DataAsDemonstrator
     from beliefgym.learning.direct_multi_step import DirectMultiStep
     from beliefgym.learning.dynamics import DivergenceWarning, DynamicsModel
+    from beliefgym.learning.filter_diagnostics import (
+        calibration,
+        error_over_time,
+        filter_jacobian,
+        look_ahead_errors,
+        spectral_radius,
+        stability,
+    )
     from beliefgym.learning.filter_errors import FilterErrors
     from beliefgym.learning.filter_files import load_filter, save_filter
     from beliefgym.learning.filters import Filter
@@ -76,16 +84,22 @@ __all__ = [
     "VideoTexture",
     "WeightedMultiHorizon",
     "Windows",
+    "calibration",
     "delay_embedding",
+    "error_over_time",
+    "filter_jacobian",
     "from_csv",
     "from_minari",
     "load_filter",
     "load_npz",
+    "look_ahead_errors",
     "multi_step_errors",
     "read_frames",
     "save_filter",
     "save_npz",
+    "spectral_radius",
     "split_video",
+    "stability",
     "to_csv",
     "to_minari",
 ]
@@ -118,9 +132,15 @@ _MODULES = {
     "ScheduledSampling": "scheduled_sampling",
     "VideoTexture": "video_textures",
     "WeightedMultiHorizon": "backprop_through_time",
+    "calibration": "filter_diagnostics",
+    "error_over_time": "filter_diagnostics",
+    "filter_jacobian": "filter_diagnostics",
     "load_filter": "filter_files",
+    "look_ahead_errors": "filter_diagnostics",
     "multi_step_errors": "multi_step_error",
     "save_filter": "filter_files",
+    "spectral_radius": "filter_diagnostics",
+    "stability": "filter_diagnostics",
 }
 
 

@@ -211,7 +211,7 @@ class Filter(BaseEstimator, ABC):
             )
 
     def _standardised(self, sequences: Sequences) -> Array:
-        """(n_episodes, n_steps + 1, n_obs), 0 past an episode's end, where nothing is to take a belief out of its bounds."""
+        """(n_episodes, n_steps + 1, n_obs), 0 past an episode's end, where no belief is to leave its bounds."""
         self._check_fitted()
         if sequences.n_obs != self.n_obs_:
             raise ValueError(

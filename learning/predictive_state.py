@@ -11,7 +11,9 @@ Reference: thesis proposal, Secs. 3.3.1 to 3.3.3. Eqs. 3.19 and 3.23 print the m
 
 from __future__ import annotations
 
+import os
 import warnings
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,11 +60,27 @@ class PredictiveStateFilter(Filter):
             )
         return self._phi.read_variance(self._state(b))[:, 0] * np.square(self._scale.scale)
 
-    def _begin_predictive(self, train: Sequences, validation: Sequences | None) -> tuple[Array, Counts]:
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the fitted filter to one file of plain arrays, as `save_filter`; `load_filter` reads it.
+
+        Args:
+            path: the file, used as it is; ".safetensors" is usual.
+
+        Returns:
+            The path.
+
+        Raises:
+            TypeError: features of one's own, or a regressor that is neither `Ridge` nor `RandomFourierRidge`.
+        """
+        from beliefgym.learning.filter_files import save_filter
+
+        return save_filter(self, path)
+
+    def _begin_predictive(self, train: Sequences, validation: Sequences | None) -> TrainingData:
         """Coordinates, features, the initial belief and the bounds, from the training data.
 
         Returns:
-            As `_targets`.
+            The trajectories of k + 1 observations or more; the others are left out of everything.
 
         Raises:
             ValueError: parameters out of range; not one trajectory of k + 1 observations.
@@ -70,23 +88,28 @@ class PredictiveStateFilter(Filter):
         check_whole("n_future", self.n_future, 1)
         if not self.belief_limit > 0:
             raise ValueError(f"expected belief_limit above 0, got {self.belief_limit!r}")
+        if isinstance(train, Sequences) and train.n_transitions:
+            short = self._n_targets(train) < 2
+            if short.any():
+                warnings.warn(
+                    f"{short.sum()} of {len(train)} trajectories have fewer than n_future + 1 = "
+                    f"{self.n_future + 1} observations: nothing is learned from them",
+                    stacklevel=3,
+                )
+                train = train[~short]
         self._begin(train, validation)
         z, n_targets = self._scale.apply(train.observations), self._n_targets(train)
-        short = n_targets < 2
-        if short.any():
-            warnings.warn(
-                f"{short.sum()} of {len(train)} trajectories have fewer than n_future + 1 = {self.n_future + 1} "
-                f"observations: nothing is learned from them",
-                stacklevel=3,
-            )
         futures = cut_futures(z, self.n_future)
         complete = np.arange(futures.shape[1]) < n_targets[:, None]
         self._phi: FutureFeatures = future_features(self.features, futures[complete])
         targets, n_targets = self._targets(train)
-        self._first_belief = targets[n_targets > 0, 0].mean(axis=0)
-        largest = np.abs(targets).max(axis=(0, 1))
-        self._bound = self.belief_limit * np.where(largest > 0, largest, 1.0)
-        return targets, n_targets
+        self._first_belief = targets[:, 0].mean(axis=0)
+        rows = targets[np.arange(targets.shape[1]) < n_targets[:, None]]
+        largest = np.abs(rows).max(axis=0)
+        # where a feature does not vary, its largest value may be rounding: no bound of that size
+        still = Standardisation.of(rows).constant | (self.standardise is True)
+        self._bound = self.belief_limit * np.where(still, np.maximum(largest, 1.0), largest)
+        return TrainingData(targets, n_targets, self._scale, train)
 
     def _targets(self, sequences: Sequences) -> tuple[Array, Counts]:
         """phi(f_t) of every t.
@@ -111,6 +134,12 @@ class PredictiveStateFilter(Filter):
                 f"{len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower n_future"
             )
         return n_targets
+
+    def _standardised(self, sequences: Sequences) -> Array:
+        """As of the base, and 0 past an episode's end: what stands there never takes a belief out of its bounds."""
+        z = super()._standardised(sequences)
+        z[~sequences.observation_mask] = 0.0
+        return z
 
     def _initial(self) -> Array:
         return self._first_belief
@@ -172,14 +201,14 @@ class TrainingData:
         sequences: the trajectories.
 
     Attributes:
-        z: (n, n_rows, n_obs) standardised. lengths: (n,) steps.
+        sequences: as given. z: (n, n_rows, n_obs) standardised. lengths: (n,) steps.
         targets: (n, n_rows, size) phi(f_t), 0 where f_t is not complete. n_targets: (n,) those that are.
     """
 
     def __init__(
         self, targets: Array, n_targets: Counts, scale: Standardisation, sequences: Sequences
     ) -> None:
-        self.targets, self.n_targets = targets, n_targets
+        self.sequences, self.targets, self.n_targets = sequences, targets, n_targets
         self.z, self.lengths = scale.apply(sequences.observations), sequences.lengths
 
     @property

@@ -129,7 +129,7 @@ class PSIM(PredictiveStateFilter):
             TypeError: not `Sequences`.
         """
         self._check_parameters()
-        data = TrainingData(*self._begin_predictive(train, validation), self._scale, train)
+        data = self._begin_predictive(train, validation)
         regressor = Ridge() if self.regressor is None else self.regressor
         self._told_divergence = True  # hypotheses on the way may leave the bounds; the history counts it
         self.history_: dict[str, Array] = {name: np.full(self.n_iterations + 1, np.nan) for name in HISTORY}
@@ -170,9 +170,10 @@ class PSIM(PredictiveStateFilter):
     def partial_fit(self, train: Sequences) -> Self:
         """Go on learning from new trajectories: one iteration of Algorithm 4 on them, on top of the aggregate.
 
-        The present filter goes over them, what it meets joins the aggregate of `fit`, and the next hypothesis is
-        fitted to all of it: follow the leader, whose regret against the best fixed filter grows more slowly than the
-        number of calls. Coordinates, features and initial belief stay those of `fit`.
+        The latest hypothesis (after `fit` that is F_N, whichever was chosen) goes over them, what it meets joins the
+        aggregate of `fit`, and the next one is fitted to all of it: follow the leader, whose regret against the best
+        fixed filter grows more slowly than the number of calls. Coordinates, features and initial belief stay those
+        of `fit`.
 
         Args:
             train: trajectories of at least n_future + 1 observations.
@@ -240,12 +241,13 @@ class PSIM(PredictiveStateFilter):
             data: the trajectories. pairs: are given ((m_t, x_t), phi(f_{t+1})) wherever that is complete.
 
         Returns:
-            Beliefs m_t (n_episodes, n_steps + 1, size), and how many were outside their bounds.
+            Beliefs m_t (n_episodes, n_steps + 1, size), 0 past an episode's end, and how many were outside their
+            bounds.
         """
         z, bound = data.z, self._bound
         assert bound is not None
         n, n_rows, _ = z.shape
-        beliefs = np.empty((n, n_rows, self._phi.size))
+        beliefs = np.zeros((n, n_rows, self._phi.size))
         beliefs[:, 0] = self._first_belief
         n_bounded = 0
         learnt = data.is_learnt

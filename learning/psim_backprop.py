@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from copy import copy
 from typing import Literal, Self, get_args
 
 import numpy as np
@@ -113,7 +114,7 @@ class BackpropPSIM(PredictiveStateFilter):
         self.psim_ = psim.fit(train, validation) if self.init == "dagger" else None
         self.n_future, self.features = psim.n_future, psim.features
         self.standardise, self.belief_limit = psim.standardise, psim.belief_limit
-        data = TrainingData(*self._begin_predictive(train, validation), self._scale, train)
+        data = self._begin_predictive(train, validation)
         rng = np.random.default_rng(self.random_state)
         regressor = self._start(psim, data, rng)
         walk = Walk(self, regressor, LossThroughTime(self, data, regressor))
@@ -139,14 +140,14 @@ class BackpropPSIM(PredictiveStateFilter):
             self.history_["epoch"][epoch] = epoch
             self.history_["loss"][epoch] = np.mean(losses) if losses else np.nan
             if callable(self.features):
-                self._learn_to_read(self.beliefs(train)[:, :-1], data.z, data.n_targets)
+                self._learn_to_read(self.beliefs(data.sequences)[:, :-1], data.z, data.n_targets)
             criterion = -float(epoch)
             if validation is not None:
                 criterion = self.history_["validation_error"][epoch] = self._next_error(validation)
             if criterion < best:
-                best, self.best_epoch_, chosen = criterion, epoch, self.model_
+                best, self.best_epoch_, chosen = criterion, epoch, (self.model_, copy(self._phi))
             self.history_["seconds"][epoch] = time.perf_counter() - started
-        self.model_ = chosen
+        self.model_, self._phi = chosen
         self._told_divergence = False
         return self
 

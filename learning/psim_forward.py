@@ -75,10 +75,10 @@ class ForwardPSIM(PredictiveStateFilter):
             ValueError: no step for which there are min_trajectories; parameters out of range. TypeError.
         """
         check_whole("min_trajectories", self.min_trajectories, 1)
-        targets, n_targets = self._begin_predictive(train, validation)
+        data = self._begin_predictive(train, validation)
+        z, targets, n_targets = data.z, data.targets, data.n_targets
         bound = self._bound
         assert bound is not None
-        z = self._scale.apply(train.observations)
         regressor = Ridge() if self.regressor is None else self.regressor
         learnt = np.arange(z.shape[1])[:, None] + 1 < n_targets  # (n_rows, n)
         self.n_steps_ = int(np.count_nonzero(learnt.sum(axis=1) >= self.min_trajectories))

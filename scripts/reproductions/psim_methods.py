@@ -21,6 +21,7 @@ from sklearn.exceptions import ConvergenceWarning
 from beliefgym.learning import Sequences
 from beliefgym.learning.autoregressive_filter import AutoregressiveFilter
 from beliefgym.learning.dynamics import DivergenceWarning
+from beliefgym.learning.filter_diagnostics import calibration
 from beliefgym.learning.filters import Filter
 from beliefgym.learning.instrumental_regression import InstrumentalVariableRegression
 from beliefgym.learning.kalman_filter import KalmanFilter
@@ -44,6 +45,8 @@ RANDOM_EPOCHS, FINE_EPOCHS = 100, 30  # of back-propagation from random starts, 
 RANDOM_RATES, FINE_RATES = (1e-2,), (3e-4,)  # of 3e-5 .. 3e-2, on another split of arm and assembly
 WAVES_B, WAVES_EPOCHS = 100, 40  # of back-propagation with random features, which costs the most
 SIZES = (128,)  # of recurrent networks; of 64, 128 and 256 the best, on other splits of assembly and arm
+WITH_VARIANCE = ("PSIM-Linear_d, phi_2", "N4SID", "IVR", "Kalman, EM", "Kalman, MAP")
+LEAST_VARIANCE = 1e-3  # of a component's mean squared error: predicted variances below it are raised to it
 Settings = list[dict[str, Any]]
 Make = Callable[..., Filter]
 
@@ -274,5 +277,14 @@ def results(
                 "seconds": one.seconds,
                 "seconds_tuning": one.seconds_tuning,
             }
+            if name in WITH_VARIANCE:
+                told = calibration(one.filter, test, LEAST_VARIANCE)
+                found[name]["calibration"] = {
+                    "nominal": told.nominal.tolist(),
+                    "coverage": told.coverage.tolist(),
+                    "log_likelihood": told.log_likelihood,
+                    "constant_log_likelihood": told.constant_log_likelihood,
+                    "n_without_variance": told.n_without_variance,
+                }
     last = float(np.square(np.diff(test.observations, axis=1)[test.step_mask]).sum(axis=1).mean())
     return {"methods": found, "last_value": last, "n_train": train.n_transitions, "n_test": len(test)}

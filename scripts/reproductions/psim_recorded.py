@@ -135,8 +135,8 @@ NOTES = [
     "Folds share training data, so that the intervals are somewhat too narrow.",
     "`fit, s`: seconds of the chosen setting's fit alone on one thread, while another process ran: an order of "
     "magnitude. `beliefgym benchmark filter` measures speed.",
-    "Arm: its 81 trajectories are five families of near replicates, held out whole; ten pairs of a family to test and one "
-    "to validate on, so that every family is tested on twice. On a random split the network interpolates between "
+    "Arm: its 81 trajectories are five families of near replicates, held out whole; ten pairs of a family to test and "
+    "one to validate on, so that every family is tested on twice. On a random split the network interpolates between "
     "replicates.",
     "Assembly: 20 of 46 trials are near replicates and are held out together, in one fold. Flag: simulated (a MuJoCo "
     "cloth). Pumpjack and fire are clips of 8 and 10 s, with blocks of 20 frames to test on.",
