@@ -29,6 +29,7 @@ REPRODUCTIONS = {
     "control-arm": "beliefgym.scripts.reproductions.control_arm:run",
     "psim-synthetic": "beliefgym.scripts.reproductions.psim_synthetic:run",
     "psim-recorded": "beliefgym.scripts.reproductions.psim_recorded:run",
+    "psim-amount": "beliefgym.scripts.reproductions.psim_amount:run",
 }
 
 

@@ -21,7 +21,6 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from beliefgym.envs.pendulum import Pendulum
 from beliefgym.learning import Sequences
 from beliefgym.learning.dynamics import DivergenceWarning
 from beliefgym.learning.kalman_filter import KalmanFilter
@@ -32,7 +31,7 @@ from beliefgym.learning.random_fourier import RandomFourierRidge
 from beliefgym.learning.recurrent_filter import GRUFilter
 from beliefgym.scripts.benchmarks.dad import product_rate
 from beliefgym.scripts.benchmarks.measuring import Rate, rates, row
-from beliefgym.scripts.reproductions.dad_data import free_motion
+from beliefgym.scripts.reproductions.psim_data import noisy_pendulum
 
 Floats = NDArray[np.float64]
 N_TRAJECTORIES, N_STEPS = 200, 100
@@ -91,14 +90,7 @@ def linear() -> tuple[Sequences, Sequences, float]:
 def pendulum() -> tuple[Sequences, Sequences, float]:
     """The same of the free pendulum, by the noisy cosine and sine of its angle; the noise alone is the floor."""
     rng = np.random.default_rng(1)
-
-    def part() -> Sequences:
-        starts = rng.uniform(-1.0, 1.0, (N_TRAJECTORIES, 2)) * np.array([np.pi, 1.0])
-        angle = free_motion(Pendulum.uncontrolled(dt=0.05), starts, N_STEPS, 0.0, rng)[:, :, 0]
-        seen = np.stack([np.cos(angle), np.sin(angle)], axis=2)
-        return Sequences.from_observations(seen + NOISE * rng.standard_normal(seen.shape))
-
-    train, validation = part(), part()
+    train, validation = (noisy_pendulum(N_TRAJECTORIES, N_STEPS, NOISE, rng) for _ in range(2))
     return train, validation, float(np.square(NOISE / train.observations.reshape(-1, 2).std(axis=0)).sum())
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from beliefgym.envs.pendulum import Pendulum
 from beliefgym.learning import Sequences
 from beliefgym.learning.dynamics import Standardise
 from beliefgym.learning.splits import fold_indices
@@ -118,6 +119,18 @@ def parts(name: str, fold: int, paths: dict[str, Any]) -> Parts:
         return Sequences.from_observations(scaled[chosen], observation_names=names)
 
     return part(train), part(validation), part(test)
+
+
+def noisy_pendulum(n: int, n_steps: int, noise: float, rng: np.random.Generator) -> Sequences:
+    """A free pendulum of which only the cosine and sine of its angle are seen, with noise; 0.05 s a step.
+
+    Args:
+        n: trajectories. n_steps: of each. noise: standard deviation. rng: of starts and noise.
+    """
+    starts = rng.uniform(-1.0, 1.0, (n, 2)) * np.array([np.pi, 1.0])
+    angle = dad_data.free_motion(Pendulum.uncontrolled(dt=0.05), starts, n_steps, 0.0, rng)[:, :, 0]
+    seen = np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    return Sequences.from_observations(seen + noise * rng.standard_normal(seen.shape))
 
 
 def is_replicate(trials: NDArray[np.str_]) -> NDArray[np.bool_]:

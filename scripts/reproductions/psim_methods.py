@@ -112,10 +112,13 @@ def linear_group(
     yield (
         "IVR",
         tuned(
-            lambda: InstrumentalVariableRegression(
-                n_future=k, rank=[r for r in RANKS if r <= k * parts[0].n_obs], standardise=scaled
+            lambda ridge: InstrumentalVariableRegression(
+                n_future=k,
+                rank=[r for r in RANKS if r <= k * parts[0].n_obs],
+                ridge=ridge,
+                standardise=scaled,
             ),
-            [{}],
+            [{"ridge": ridge} for ridge in (0.0, *ALPHAS)],
             *parts,
         ),
     )
