@@ -1,6 +1,7 @@
 """`AutoregressiveFilter`: the next observation by regression on the last k ones, AR-k.
 
-    x_hat_t = g(x_{t-1}, .., x_{t-k}),     m_t = [x_{t-1}, .., x_{t-k}]
+    x_hat_t = g(x_{t-1}, .., x_{t-k}),     m_t = [x_{t-1}, .., x_{t-k}]          (target "next")
+    x_hat_t = x_{t-1} + g(x_{t-1}, .., x_{t-k})                                  (target "delta")
 
 The belief is those k observations themselves, the newest first. Before the first observation all of them are the
 training data's mean, and while fewer than k have been seen the mean stands for the missing ones.
@@ -11,13 +12,13 @@ mean, which is also what g is trained on there, is this package's choice.
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beliefgym.learning.aggregation import learner_for, predict_unchecked
-from beliefgym.learning.dynamics import Standardise
+from beliefgym.learning.dynamics import Standardise, Target
 from beliefgym.learning.filters import Filter, check_whole
 from beliefgym.learning.linear_in_features import Ridge
 from beliefgym.learning.sequences import Sequences
@@ -34,6 +35,7 @@ class AutoregressiveFilter(Filter):
     Args:
         regressor: learns g; any scikit-learn regressor. None for `Ridge()`.
         n_past: k, at least 1.
+        target: "next" or "delta": what regularisation falls back to, the mean or the last observation.
         standardise: bring components to one scale: True each by its own standard deviation, "together" all by one
             number (components of one unit), False not.
         pad_start: also learn from the first k steps of each trajectory, with the mean for what was not seen yet, so
@@ -53,11 +55,13 @@ class AutoregressiveFilter(Filter):
         regressor: Any = None,
         *,
         n_past: int = 5,
+        target: Target = "next",
         standardise: Standardise = True,
         pad_start: bool = True,
     ) -> None:
         self.regressor = regressor
         self.n_past = n_past
+        self.target = target
         self.standardise = standardise
         self.pad_start = pad_start
 
@@ -71,13 +75,17 @@ class AutoregressiveFilter(Filter):
             validation: not used; checked.
 
         Raises:
-            ValueError: n_past below 1; no window.
+            ValueError: n_past below 1; an unknown target; no window.
         """
         check_whole("n_past", self.n_past, 1)
+        if self.target not in get_args(Target):
+            raise ValueError(f"expected target to be one of {get_args(Target)}, got {self.target!r}")
         self._begin(train, validation)
         rows = train.observations[train.observation_mask]
         self._first = np.tile(self._scale.apply(rows.mean(axis=0)), self.n_past)
         inputs, targets = self._windows(self._scale.apply(train.observations), train.lengths)
+        if self.target == "delta":
+            targets = targets - inputs[:, : self.n_obs_]
         regressor = Ridge() if self.regressor is None else self.regressor
         self.model_ = learner_for(regressor, "follow_the_leader", inputs, targets).frozen()
         z = self._scale.apply(rows)
@@ -107,4 +115,5 @@ class AutoregressiveFilter(Filter):
         return np.concatenate([z, belief[:, : -self.n_obs_]], axis=1)
 
     def _observe(self, belief: Array) -> Array:
-        return predict_unchecked(self.model_, belief, self.n_obs_)
+        answer = predict_unchecked(self.model_, belief, self.n_obs_)
+        return answer if self.target == "next" else answer + belief[:, : self.n_obs_]

@@ -5,6 +5,15 @@
 With phi_1 a belief is a forecast: its first block is x_hat_t, its last one x_hat_{t+k-1}. Further ahead than that, the
 filter takes its own predictions for the observations that come.
 
+A filter m_{t+1} = F(m_t, x_t) is learned as a regression, G, in one of two forms:
+
+    target "next":   F(m, x) = G(m, x)                        (the thesis)
+    target "delta":  F(m, x) = G(m, x) + phi([x, .., x])
+
+Both can represent the same filters where phi is linear. A regularised G falls back to the mean in the first form and to
+"the observation stays as it is" in the second, which is the better guess where observations change little in a step and
+data are few.
+
 Reference: thesis proposal, Secs. 3.3.1 to 3.3.3. Eqs. 3.19 and 3.23 print the mean over trajectories i = 1 .. M as
 1/T sum_i^T phi(f_i^i); it is 1/M sum_i^M phi(f_1^i), as in Algorithm 3, line 2.
 """
@@ -14,10 +23,12 @@ from __future__ import annotations
 import os
 import warnings
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefgym.learning.dynamics import Target
 from beliefgym.learning.filters import Filter, check_whole
 from beliefgym.learning.future_features import (
     Features,
@@ -39,12 +50,14 @@ class PredictiveStateFilter(Filter):
     Args of every subclass:
         n_future: k.
         features: "first" (phi_1), "second" (phi_2) or a function of standardised futures (n, k, n_obs) -> (n, d).
+        target: "next" or "delta", see above.
         standardise: True each component by its own standard deviation, "together" all by one number, False not.
         belief_limit: bound of a belief's components, as a multiple of the training features' largest.
     """
 
     n_future: int
     features: Features
+    target: Target
     belief_limit: float
 
     def predict_variance(self, belief: ArrayLike) -> Array:
@@ -88,6 +101,8 @@ class PredictiveStateFilter(Filter):
         check_whole("n_future", self.n_future, 1)
         if not self.belief_limit > 0:
             raise ValueError(f"expected belief_limit above 0, got {self.belief_limit!r}")
+        if self.target not in get_args(Target):
+            raise ValueError(f"expected target to be one of {get_args(Target)}, got {self.target!r}")
         if isinstance(train, Sequences) and train.n_transitions:
             short = self._n_targets(train) < 2
             if short.any():
@@ -102,14 +117,30 @@ class PredictiveStateFilter(Filter):
         futures = cut_futures(z, self.n_future)
         complete = np.arange(futures.shape[1]) < n_targets[:, None]
         self._phi: FutureFeatures = future_features(self.features, futures[complete])
-        targets, n_targets = self._targets(train)
-        self._first_belief = targets[:, 0].mean(axis=0)
-        rows = targets[np.arange(targets.shape[1]) < n_targets[:, None]]
+        data = self._training_data(train)
+        self._first_belief = data.targets[:, 0].mean(axis=0)
+        rows = data.targets[np.arange(data.targets.shape[1]) < data.n_targets[:, None]]
         largest = np.abs(rows).max(axis=0)
         # where a feature does not vary, its largest value may be rounding: no bound of that size
         still = Standardisation.of(rows).constant | (self.standardise is True)
         self._bound = self.belief_limit * np.where(still, np.maximum(largest, 1.0), largest)
-        return TrainingData(targets, n_targets, self._scale, train)
+        return data
+
+    def _training_data(self, sequences: Sequences) -> TrainingData:
+        z = self._scale.apply(sequences.observations)
+        z[~sequences.observation_mask] = 0.0
+        base = None
+        if self.target == "delta":
+            base = self._base(z.reshape(-1, self.n_obs_)).reshape(*z.shape[:2], -1)
+        return TrainingData(*self._targets(sequences), z, base, sequences)
+
+    def _base(self, z: Array) -> Array:
+        """phi of an observation that stays as it is: (n, n_obs) -> (n, size)."""
+        return self._phi(np.repeat(z[:, None], self.n_future, axis=1))
+
+    def _completed(self, answer: Array, z: Array) -> Array:
+        """F(m, x) of the regressor's answer: (n, size) and (n, n_obs) -> (n, size)."""
+        return answer if self.target == "next" else answer + self._base(z)
 
     def _targets(self, sequences: Sequences) -> tuple[Array, Counts]:
         """phi(f_t) of every t.
@@ -197,19 +228,22 @@ class TrainingData:
     """Trajectories as a predictive state filter learns from them.
 
     Args:
-        targets, n_targets: of `PredictiveStateFilter._targets`. scale: of the observations.
+        targets, n_targets: of `PredictiveStateFilter._targets`. z: (n, n_rows, n_obs) standardised.
+        base: (n, n_rows, size) what the regressor's answer is added to, or None for nothing.
         sequences: the trajectories.
 
     Attributes:
-        sequences: as given. z: (n, n_rows, n_obs) standardised. lengths: (n,) steps.
+        sequences, z, base: as given. lengths: (n,) steps.
         targets: (n, n_rows, size) phi(f_t), 0 where f_t is not complete. n_targets: (n,) those that are.
+        answers: (n, n_rows - 1, size) what the regressor is to say of (m_t, x_t), where `is_learnt`.
     """
 
     def __init__(
-        self, targets: Array, n_targets: Counts, scale: Standardisation, sequences: Sequences
+        self, targets: Array, n_targets: Counts, z: Array, base: Array | None, sequences: Sequences
     ) -> None:
         self.sequences, self.targets, self.n_targets = sequences, targets, n_targets
-        self.z, self.lengths = scale.apply(sequences.observations), sequences.lengths
+        self.z, self.base, self.lengths = z, base, sequences.lengths
+        self.answers = targets[:, 1:] if base is None else targets[:, 1:] - base[:, :-1]
 
     @property
     def is_learnt(self) -> NDArray[np.bool_]:

@@ -28,7 +28,7 @@ from sklearn.base import BaseEstimator
 from tqdm import tqdm
 
 from beliefgym.learning.aggregation import Algorithm, Learner, learner_for, predict_unchecked
-from beliefgym.learning.dynamics import Standardise
+from beliefgym.learning.dynamics import Standardise, Target
 from beliefgym.learning.filters import check_whole
 from beliefgym.learning.future_features import Features
 from beliefgym.learning.linear_in_features import LinearInFeatures, Ridge
@@ -61,11 +61,15 @@ class PSIM(PredictiveStateFilter):
         n_future: k, observations in a predictive state.
         features: "first" for phi_1 (Eq. 3.32), "second" for phi_2 (Eq. 3.33), or a function of futures (n, k, n_obs),
             standardised -> (n, d).
+        target: "next" as in the thesis, or "delta": F(m, x) = G(m, x) + phi([x, .., x]), and G is learned. The second
+            is for observations that change little in a step, where data are few: regularisation then holds on to x_t
+            instead of the mean.
         n_iterations: N, at least 1.
         init: F_0, which the algorithm leaves open. "history" regresses phi(f_{t+1}) on (m~_t, x_t), with m~_t the
             regression of phi(f_t) on the last n_past observations, as in the first stage of two-stage regression, and
             these pairs start the aggregate; "teacher" takes phi(f_t) itself for m~_t, which holds the very
-            observations to be predicted, so that these pairs do not; "prior" always answers m_0.
+            observations to be predicted, so that these pairs do not; "prior" always answers m_0 (with target "delta"
+            that x_t stays).
         n_past: observations of that history; None for 2 n_future.
         discount: weight of the aggregate against the next iteration's pairs, in (0, 1]; 1 is the algorithm. Below 1
             what weak first hypotheses met is forgotten; a regressor linear in features is needed then.
@@ -77,7 +81,7 @@ class PSIM(PredictiveStateFilter):
         progress_bar: show the iterations.
 
     Attributes:
-        model_: the chosen F, a regressor of (m_t, x_t), standardised. best_iteration_: n of the chosen F_n.
+        model_: the chosen F (or G), a regressor of (m_t, x_t), standardised. best_iteration_: n of the chosen F_n.
         history_: arrays (N + 1,): "train_error" and "validation_error" (mean squared error of the next observation,
             standardised, summed over components), "aggregate_error" (of F_n on what it was fitted to, root mean
             square over all features), "n_pairs" in the aggregate it was fitted to, "n_bounded" beliefs that left
@@ -94,6 +98,7 @@ class PSIM(PredictiveStateFilter):
         *,
         n_future: int = 5,
         features: Features = "first",
+        target: Target = "next",
         n_iterations: int = 20,
         init: Init = "history",
         n_past: int | None = None,
@@ -107,6 +112,7 @@ class PSIM(PredictiveStateFilter):
         self.regressor = regressor
         self.n_future = n_future
         self.features = features
+        self.target = target
         self.n_iterations = n_iterations
         self.init = init
         self.n_past = n_past
@@ -184,7 +190,7 @@ class PSIM(PredictiveStateFilter):
         self._check_fitted()
         learner = self._held_learner()
         self._standardised(train)
-        self._filter(TrainingData(*self._targets(train), self._scale, train), Pairs(learner))
+        self._filter(self._training_data(train), Pairs(learner))
         learner.refit()
         self.model_ = learner.frozen()
         return self
@@ -210,7 +216,8 @@ class PSIM(PredictiveStateFilter):
         return regressor
 
     def _update(self, belief: Array, z: Array) -> Array:
-        return predict_unchecked(self.model_, self._inputs(belief, z), self._phi.size)
+        answer = predict_unchecked(self.model_, self._inputs(belief, z), self._phi.size)
+        return self._completed(answer, z)
 
     def _inputs(self, belief: Array, z: Array) -> Array:
         """(m_t, x_t) side by side: (n, size) and (n, n_obs) -> (n, size + n_obs)."""
@@ -225,10 +232,10 @@ class PSIM(PredictiveStateFilter):
         n_inputs, size = data.z.shape[2] + data.targets.shape[2], data.targets.shape[2]
         nothing = np.empty((0, n_inputs)), np.empty((0, size))
         if self.init == "prior":
-            return Constant(self._first_belief), nothing
+            return Constant(self._first_belief if self.target == "next" else np.zeros(size)), nothing
         if self.init == "teacher":
             episode, t = np.nonzero(data.is_learnt)
-            pairs = self._inputs(data.targets[episode, t], data.z[episode, t]), data.targets[episode, t + 1]
+            pairs = self._inputs(data.targets[episode, t], data.z[episode, t]), data.answers[episode, t]
         else:
             pairs = history_pairs(data, self.past_length)
         hypothesis = learner_for(regressor, "follow_the_leader", *pairs).frozen()
@@ -238,7 +245,7 @@ class PSIM(PredictiveStateFilter):
         """The present filter over all trajectories at once, one step of time after the other.
 
         Args:
-            data: the trajectories. pairs: are given ((m_t, x_t), phi(f_{t+1})) wherever that is complete.
+            data: the trajectories. pairs: are given ((m_t, x_t), answer) wherever f_{t+1} is complete.
 
         Returns:
             Beliefs m_t (n_episodes, n_steps + 1, size), 0 past an episode's end, and how many were outside their
@@ -257,7 +264,9 @@ class PSIM(PredictiveStateFilter):
                 break
             rows = slice(None) if len(going) == n else going
             inputs = self._inputs(beliefs[rows, t], z[rows, t])
-            following = pairs.met(inputs, data.targets[rows, t + 1], learnt[rows, t], self.model_)
+            following = pairs.met(inputs, data.answers[rows, t], learnt[rows, t], self.model_)
+            if data.base is not None:
+                following = following + data.base[rows, t]
             outside = ~(np.abs(following) <= bound)
             if outside.any():
                 left = outside.any(axis=1)
@@ -355,7 +364,7 @@ class Constant:
 
 
 def history_pairs(data: TrainingData, n_past: int) -> tuple[Array, Array]:
-    """Inputs (m~_t, x_t) and targets phi(f_{t+1}), with m~_t the regression of phi(f_t) on the past.
+    """Inputs (m~_t, x_t) and what a regressor is to answer, with m~_t the regression of phi(f_t) on the past.
 
     Returns:
         (n, size + n_obs) and (n, size).
@@ -365,7 +374,7 @@ def history_pairs(data: TrainingData, n_past: int) -> tuple[Array, Array]:
     state_of_past = Ridge(alpha=HISTORY_RIDGE).fit(past[known], data.targets[known])
     episode, t = np.nonzero(data.is_learnt)
     state = state_of_past.predict_unchecked(past[episode, t])
-    return np.concatenate([state, data.z[episode, t]], axis=1), data.targets[episode, t + 1]
+    return np.concatenate([state, data.z[episode, t]], axis=1), data.answers[episode, t]
 
 
 def past_windows(z: Array, n_past: int) -> Array:

@@ -48,8 +48,8 @@ class BackpropPSIM(PredictiveStateFilter):
     """A predictive state filter trained by gradients through time.
 
     Args:
-        psim: an unfitted `PSIM`, whose regressor (linear in features), future, features and scaling are taken; None for
-            `PSIM()`. With init "dagger" it is fitted first, and its filter is the start.
+        psim: an unfitted `PSIM`, whose regressor (linear in features), future, features, target and scaling are taken;
+            None for `PSIM()`. With init "dagger" it is fitted first, and its filter is the start.
         init: "random" or "dagger".
         loss: "state" for all features of the future (Eq. 3.21), "observation" for the next observation alone.
         n_epochs: passes over the training trajectories, at least 0.
@@ -112,7 +112,7 @@ class BackpropPSIM(PredictiveStateFilter):
         self._check_parameters()
         psim = clone(PSIM() if self.psim is None else self.psim)
         self.psim_ = psim.fit(train, validation) if self.init == "dagger" else None
-        self.n_future, self.features = psim.n_future, psim.features
+        self.n_future, self.features, self.target = psim.n_future, psim.features, psim.target
         self.standardise, self.belief_limit = psim.standardise, psim.belief_limit
         data = self._begin_predictive(train, validation)
         rng = np.random.default_rng(self.random_state)
@@ -152,8 +152,7 @@ class BackpropPSIM(PredictiveStateFilter):
         return self
 
     def _update(self, belief: Array, z: Array) -> Array:
-        updated: Array = self.model_.predict_unchecked(np.concatenate([belief, z], axis=1))
-        return updated
+        return self._completed(self.model_.predict_unchecked(np.concatenate([belief, z], axis=1)), z)
 
     def _start(self, psim: PSIM, data: TrainingData, rng: np.random.Generator) -> LinearInFeatures:
         """The start: DAgger's filter, or random coefficients; with the sums that whiten its features."""
@@ -219,6 +218,7 @@ class LossThroughTime:
         )
         self._targets = _tensor(targets[:, :, :kept].swapaxes(0, 1), model.device)
         self._learnt = _tensor(learnt.T[:, :, None].astype(float), model.device)
+        self._base = None if data.base is None else _tensor(data.base[:, :n_used].swapaxes(0, 1), model.device)
         self._first = _tensor(model._first_belief, model.device)
         self._truncation, self._size = model.truncation, size
         self._share = len(data.n_targets[data.n_targets > 1]) / np.count_nonzero(
@@ -240,6 +240,8 @@ class LossThroughTime:
         n_linear = size + x.shape[2] if self._has_inputs else 0
         linear, waves = weights[:n_linear], weights[n_linear:]
         given = offset + x @ linear[size:] if self._has_inputs else offset.expand(*x.shape[:2], size)
+        if self._base is not None:
+            given = given + self._base[:, items]
         angle = None if self._frequencies is None else x @ self._frequencies[size:]
         belief = self._first.expand(len(items), size)
         beliefs = []

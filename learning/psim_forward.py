@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
 from beliefgym.learning.aggregation import learner_for, predict_unchecked
-from beliefgym.learning.dynamics import Standardise
+from beliefgym.learning.dynamics import Standardise, Target
 from beliefgym.learning.filters import check_whole
 from beliefgym.learning.future_features import Features
 from beliefgym.learning.linear_in_features import Ridge
@@ -37,11 +37,11 @@ class ForwardPSIM(PredictiveStateFilter):
 
     Args:
         regressor: learns each F_t; any scikit-learn regressor. None for `Ridge()`.
-        n_future, features, standardise, belief_limit: as of `PSIM`.
+        n_future, features, target, standardise, belief_limit: as of `PSIM`.
         min_trajectories: fit an F_t only to this many trajectories or more.
 
     Attributes:
-        model_: F_0, F_1, .., regressors of (m_t, x_t), standardised. n_steps_: how many.
+        model_: F_0, F_1, .. (or G_0, ..), regressors of (m_t, x_t), standardised. n_steps_: how many.
 
     Example:
         >>> ForwardPSIM(Ridge(alpha=1e-6), n_future=2).fit(train).errors(test).by_time  # doctest: +SKIP
@@ -53,6 +53,7 @@ class ForwardPSIM(PredictiveStateFilter):
         *,
         n_future: int = 5,
         features: Features = "first",
+        target: Target = "next",
         min_trajectories: int = 1,
         standardise: Standardise = True,
         belief_limit: float = 3.0,
@@ -60,6 +61,7 @@ class ForwardPSIM(PredictiveStateFilter):
         self.regressor = regressor
         self.n_future = n_future
         self.features = features
+        self.target = target
         self.min_trajectories = min_trajectories
         self.standardise = standardise
         self.belief_limit = belief_limit
@@ -76,7 +78,7 @@ class ForwardPSIM(PredictiveStateFilter):
         """
         check_whole("min_trajectories", self.min_trajectories, 1)
         data = self._begin_predictive(train, validation)
-        z, targets, n_targets = data.z, data.targets, data.n_targets
+        z, n_targets = data.z, data.n_targets
         bound = self._bound
         assert bound is not None
         regressor = Ridge() if self.regressor is None else self.regressor
@@ -94,9 +96,10 @@ class ForwardPSIM(PredictiveStateFilter):
             met[:, t] = belief
             here = np.flatnonzero(learnt[t])
             inputs = np.concatenate([belief, z[:, t]], axis=1)
-            learner = learner_for(regressor, "follow_the_leader", inputs[here], targets[here, t + 1])
+            learner = learner_for(regressor, "follow_the_leader", inputs[here], data.answers[here, t])
             self.model_.append(learner.frozen())
-            belief = np.clip(predict_unchecked(self.model_[-1], inputs, self._phi.size), -bound, bound)
+            answer = predict_unchecked(self.model_[-1], inputs, self._phi.size)
+            belief = np.clip(self._completed(answer, z[:, t]), -bound, bound)
         met[:, self.n_steps_ :] = belief[:, None]
         self._learn_to_read(met, z, np.minimum(n_targets, self.n_steps_))
         self._bound = np.append(bound, np.inf)
@@ -120,5 +123,6 @@ class ForwardPSIM(PredictiveStateFilter):
         following[:, -1] = belief[:, -1] + 1
         for t in np.unique(steps):
             rows = slice(None) if (steps == t).all() else steps == t
-            following[rows, :-1] = predict_unchecked(self.model_[t], inputs[rows], self._phi.size)
+            answer = predict_unchecked(self.model_[t], inputs[rows], self._phi.size)
+            following[rows, :-1] = self._completed(answer, z[rows])
         return following

@@ -120,6 +120,8 @@ class LearningStream:
         if len(complete):
             order = (oldest + 1 + np.arange(k)) % (k + 1)
             targets = psim._phi(self._met[complete[:, None], order, size:])
+            if psim.target == "delta":
+                targets = targets - psim._base(self._met[complete, oldest, size:])
             self._learner.add(self._learner.encode(self._met[complete, oldest]), targets)
         # from here on nothing can fail
         predicted = self._n_seen > 0
