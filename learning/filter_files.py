@@ -31,7 +31,13 @@ from beliefgym.learning.whole_files import written_whole
 
 FORMAT_VERSION = 1
 HEADER = "beliefgym_filter"
-OF_PSIM = ("n_future", "features", "target", "standardise", "belief_limit")  # what a BackpropPSIM takes from its PSIM
+OF_PSIM = (
+    "n_future",
+    "features",
+    "target",
+    "standardise",
+    "belief_limit",
+)  # what a BackpropPSIM takes from its PSIM
 
 
 def save_filter(filter: Filter, path: str | os.PathLike[str]) -> Path:

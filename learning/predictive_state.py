@@ -127,9 +127,8 @@ class PredictiveStateFilter(Filter):
         return data
 
     def _training_data(self, sequences: Sequences) -> TrainingData:
-        z = self._scale.apply(sequences.observations)
+        z, base = self._scale.apply(sequences.observations), None
         z[~sequences.observation_mask] = 0.0
-        base = None
         if self.target == "delta":
             base = self._base(z.reshape(-1, self.n_obs_)).reshape(*z.shape[:2], -1)
         return TrainingData(*self._targets(sequences), z, base, sequences)
@@ -165,12 +164,6 @@ class PredictiveStateFilter(Filter):
                 f"{len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower n_future"
             )
         return n_targets
-
-    def _standardised(self, sequences: Sequences) -> Array:
-        """As of the base, and 0 past an episode's end: what stands there never takes a belief out of its bounds."""
-        z = super()._standardised(sequences)
-        z[~sequences.observation_mask] = 0.0
-        return z
 
     def _initial(self) -> Array:
         return self._first_belief

@@ -218,7 +218,9 @@ class LossThroughTime:
         )
         self._targets = _tensor(targets[:, :, :kept].swapaxes(0, 1), model.device)
         self._learnt = _tensor(learnt.T[:, :, None].astype(float), model.device)
-        self._base = None if data.base is None else _tensor(data.base[:, :n_used].swapaxes(0, 1), model.device)
+        self._base = (
+            None if data.base is None else _tensor(data.base[:, :n_used].swapaxes(0, 1), model.device)
+        )
         self._first = _tensor(model._first_belief, model.device)
         self._truncation, self._size = model.truncation, size
         self._share = len(data.n_targets[data.n_targets > 1]) / np.count_nonzero(

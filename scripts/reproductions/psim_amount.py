@@ -1,8 +1,8 @@
 """`beliefgym reproduce psim-amount`: predictive state filters against a recurrent network, by the amount of data.
 
 Who wins, with how many trajectories, at which training time: PSIM-Linear_d, PSIM-RFF_d and a GRU filter, tuned as in
-`psim-recorded`, on so many of the training trajectories of the recorded assembly and motion capture (five folds), and of
-a pendulum seen by the noisy cosine and sine of its angle (five seeds; simulated, so that data do not run out).
+`psim-recorded`, on some of the training trajectories of the recorded assembly and motion capture (five folds), and of a
+pendulum seen by the noisy cosine and sine of its angle (five seeds; simulated, so that data do not run out).
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from beliefgym.learning import Sequences
-from beliefgym.learning.linear_in_features import Ridge
-from beliefgym.learning.psim import PSIM
 from beliefgym.scripts.reproductions import psim_methods as methods
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.dad_figures import STYLE, plain, save
@@ -109,21 +107,11 @@ def cell(cell: dict[str, Any], paths: dict[str, Any]) -> dict[str, Any]:
     torch.set_num_threads(1)
     recording = SETTINGS[cell["data"]]
     train, validation, test = _parts(cell, paths)
-    k, scaled = recording.n_future, recording.standardise
-    ridges: methods.Settings = [{"alpha": alpha} for alpha in methods.ALPHAS]
+    data, seed = (train, validation), cell["fold"]
     chosen = {
-        LINEAR: methods.tuned(
-            lambda alpha: PSIM(
-                Ridge(alpha=alpha), n_future=k, standardise=scaled, n_iterations=methods.N_ITERATIONS
-            ),
-            ridges,
-            train,
-            validation,
-        ),
-        WAVES: dict(islice(methods.waves_group(recording, (train, validation), cell["fold"]), 2))[WAVES],
-        NETWORK: dict(islice(methods.recurrent_group(recording, (train, validation), cell["fold"]), 1))[
-            NETWORK
-        ],
+        LINEAR: methods.tuned(methods.linear_psim(recording), methods.RIDGES, *data),
+        WAVES: dict(islice(methods.waves_group(recording, data, seed), 2))[WAVES],
+        NETWORK: dict(islice(methods.recurrent_group(recording, data, seed), 1))[NETWORK],
     }
     results = {
         name: {

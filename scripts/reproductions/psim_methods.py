@@ -20,7 +20,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from beliefgym.learning import Sequences
 from beliefgym.learning.autoregressive_filter import AutoregressiveFilter
-from beliefgym.learning.dynamics import DivergenceWarning
+from beliefgym.learning.dynamics import DivergenceWarning, Target
 from beliefgym.learning.filter_diagnostics import calibration
 from beliefgym.learning.filters import Filter
 from beliefgym.learning.instrumental_regression import InstrumentalVariableRegression
@@ -48,6 +48,7 @@ SIZES = (128,)  # of recurrent networks; of 64, 128 and 256 the best, on other s
 WITH_VARIANCE = ("PSIM-Linear_d, phi_2", "N4SID", "IVR", "Kalman, EM", "Kalman, MAP")
 LEAST_VARIANCE = 1e-3  # of a component's mean squared error: predicted variances below it are raised to it
 Settings = list[dict[str, Any]]
+RIDGES: Settings = [{"alpha": alpha} for alpha in ALPHAS]
 Make = Callable[..., Filter]
 
 
@@ -88,19 +89,8 @@ def linear_group(
 ) -> Iterator[tuple[str, Tuned]]:
     """Everything that is linear or a closed form."""
     k, scaled = recording.n_future, recording.standardise
-    ridges: Settings = [{"alpha": alpha} for alpha in ALPHAS]
-
-    def autoregressive(n_past: int) -> Make:
-        return lambda alpha: AutoregressiveFilter(Ridge(alpha=alpha), n_past=n_past, standardise=scaled)
-
-    def psim(**options: Any) -> Make:
-        return lambda alpha: PSIM(
-            Ridge(alpha=alpha),
-            **{"n_future": k, "standardise": scaled, "n_iterations": N_ITERATIONS, **options},
-        )
-
-    yield "AR-5", tuned(autoregressive(5), ridges, *parts)
-    yield "AR-10", tuned(autoregressive(10), ridges, *parts)
+    yield "AR-5", tuned(_linear_autoregression(recording), RIDGES, *parts)
+    yield "AR-10", tuned(_linear_autoregression(recording, n_past=10), RIDGES, *parts)
     yield (
         "N4SID",
         tuned(
@@ -122,16 +112,53 @@ def linear_group(
             *parts,
         ),
     )
-    yield "PSIM-Linear_d", tuned(psim(), ridges, *parts)
-    yield "PSIM-Linear_d, k = 1", tuned(psim(n_future=1), ridges, *parts)
-    yield "PSIM-Linear_d, phi_2", tuned(psim(features="second"), ridges, *parts)
+    yield "PSIM-Linear_d", tuned(linear_psim(recording), RIDGES, *parts)
+    yield "PSIM-Linear_d, k = 1", tuned(linear_psim(recording, n_future=1), RIDGES, *parts)
+    yield "PSIM-Linear_d, phi_2", tuned(linear_psim(recording, features="second"), RIDGES, *parts)
+
+
+def delta_group(
+    recording: Recording, parts: tuple[Sequences, Sequences], seed: int
+) -> Iterator[tuple[str, Tuned]]:
+    """The filters that hold on to the last observation (target "delta"), linear and with random features."""
+    yield "AR-5, delta", tuned(_linear_autoregression(recording, target="delta"), RIDGES, *parts)
+    yield "PSIM-Linear_d, delta", tuned(linear_psim(recording, target="delta"), RIDGES, *parts)
+    autoregressive, psim = _makes_of_waves(recording, parts[0].n_obs, seed, "delta")
+    yield "AR-5, RFF, delta", screened(autoregressive, recording, parts)
+    yield "PSIM-RFF_d, delta", screened(psim(recording.n_future), recording, parts)
+
+
+def _linear_autoregression(recording: Recording, **options: Any) -> Make:
+    return lambda alpha: AutoregressiveFilter(
+        Ridge(alpha=alpha), **{"n_past": 5, "standardise": recording.standardise, **options}
+    )
+
+
+def linear_psim(recording: Recording, **options: Any) -> Make:
+    """PSIM-Linear_d by its ridge."""
+    common = {
+        "n_future": recording.n_future,
+        "standardise": recording.standardise,
+        "n_iterations": N_ITERATIONS,
+    }
+    return lambda alpha: PSIM(Ridge(alpha=alpha), **{**common, **options})
 
 
 def waves_group(
     recording: Recording, parts: tuple[Sequences, Sequences], seed: int
 ) -> Iterator[tuple[str, Tuned]]:
     """Random Fourier features, in an autoregression and in PSIM."""
-    k, scaled, n_obs = recording.n_future, recording.standardise, parts[0].n_obs
+    autoregressive, psim = _makes_of_waves(recording, parts[0].n_obs, seed, "next")
+    yield "AR-5, RFF", screened(autoregressive, recording, parts)
+    yield "PSIM-RFF_d", screened(psim(recording.n_future), recording, parts)
+    yield "PSIM-RFF_d, k = 1", screened(psim(1), recording, parts)
+
+
+def _makes_of_waves(
+    recording: Recording, n_obs: int, seed: int, target: Target
+) -> tuple[Make, Callable[[int], Make]]:
+    """An autoregression on five observations, and PSIM by its k."""
+    scaled = recording.standardise
 
     def waves(n_inputs: int, n_frequencies: int, bandwidth: float, alpha: float) -> RandomFourierRidge:
         return RandomFourierRidge(
@@ -142,27 +169,31 @@ def waves_group(
             random_state=seed,
         )
 
-    alphas = ALPHAS[2:] if recording.is_video else ALPHAS[:4]  # videos have few frames, and much that is new
-    grid: Settings = [{"bandwidth": b, "alpha": a} for b, a in product(BANDWIDTHS, alphas)]
-
     def autoregressive(n_iterations: int, n_frequencies: int, **setting: float) -> Filter:
         regressor = waves(5 * n_obs, n_frequencies, **setting)
-        return AutoregressiveFilter(regressor, n_past=5, standardise=scaled)
+        return AutoregressiveFilter(regressor, n_past=5, target=target, standardise=scaled)
 
     def psim(n_future: int) -> Make:
         def make(n_iterations: int, n_frequencies: int, **setting: float) -> Filter:
             regressor = waves((n_future + 1) * n_obs, n_frequencies, **setting)
-            return PSIM(regressor, n_future=n_future, standardise=scaled, n_iterations=n_iterations)
+            return PSIM(
+                regressor, n_future=n_future, target=target, standardise=scaled, n_iterations=n_iterations
+            )
 
         return make
 
-    makes = {"AR-5, RFF": autoregressive, "PSIM-RFF_d": psim(k), "PSIM-RFF_d, k = 1": psim(1)}
-    for name, make in makes.items():
-        started = time.perf_counter()
-        small = {"n_iterations": SCREENING, "n_frequencies": SCREENED_WAVES}
-        screened = tuned(make, [{**one, **small} for one in grid], *parts).setting
-        full = {**screened, "n_iterations": N_ITERATIONS, "n_frequencies": WAVES}
-        yield name, replace(tuned(make, [full], *parts), seconds_tuning=time.perf_counter() - started)
+    return autoregressive, psim
+
+
+def screened(make: Make, recording: Recording, parts: tuple[Sequences, Sequences]) -> Tuned:
+    """Choose bandwidth and ridge with few features and iterations, and fit the choice with all."""
+    started = time.perf_counter()
+    alphas = ALPHAS[2:] if recording.is_video else ALPHAS[:4]  # videos have few frames, and much that is new
+    small = {"n_iterations": SCREENING, "n_frequencies": SCREENED_WAVES}
+    grid: Settings = [{"bandwidth": b, "alpha": a, **small} for b, a in product(BANDWIDTHS, alphas)]
+    chosen = tuned(make, grid, *parts).setting
+    full = {**chosen, "n_iterations": N_ITERATIONS, "n_frequencies": WAVES}
+    return replace(tuned(make, [full], *parts), seconds_tuning=time.perf_counter() - started)
 
 
 def kalman_group(
@@ -194,9 +225,7 @@ def gradient_group(
 
     k, scaled = recording.n_future, recording.standardise
     common: dict[str, Any] = {"n_future": k, "standardise": scaled, "n_iterations": N_ITERATIONS}
-    dagger = tuned(
-        lambda alpha: PSIM(Ridge(alpha=alpha), **common), [{"alpha": alpha} for alpha in ALPHAS], *parts
-    )
+    dagger = tuned(linear_psim(recording), RIDGES, *parts)
     linear = PSIM(Ridge(**dagger.setting), **common)
     n_epochs = (
         RANDOM_EPOCHS // 4 if recording.thesis_column == "Flag Video" else RANDOM_EPOCHS
@@ -248,6 +277,7 @@ def recurrent_group(
 
 GROUPS = {
     "linear": linear_group,
+    "delta": delta_group,
     "waves": waves_group,
     "gradient": gradient_group,
     "recurrent": recurrent_group,

@@ -60,7 +60,8 @@ def rolled_out(model, z, weights, offset, held=None, truncation=None):
         if truncation is not None and t and t % truncation == 0:
             start = held[t]
         phi = model.model_.features(np.concatenate([start, z[t]])[None])[0]
-        m.append(phi @ weights + offset)
+        stays = np.tile(z[t], (1, model.n_future, 1))  # x_t, k times
+        m.append(phi @ weights + offset + (model._phi(stays)[0] if model.target == "delta" else 0.0))
     return m
 
 
@@ -81,11 +82,13 @@ def loss_by_hand(model, train, weights, offset, held=None, truncation=None):
 @each_regressor
 @pytest.mark.parametrize("features", ["first", "second"])
 @pytest.mark.parametrize("loss", ["state", "observation"])
-@pytest.mark.parametrize("truncation", [None, 3])
-def test_the_loss_is_the_mean_squared_error_of_the_filter_rolled_out(regressor, features, loss, truncation):
+@pytest.mark.parametrize(("target", "truncation"), [("next", None), ("next", 3), ("delta", None)])
+def test_the_loss_is_the_mean_squared_error_of_the_filter_rolled_out(
+    regressor, features, loss, target, truncation
+):
     train = turning(lengths=[length for length in LENGTHS if length > 1])
     model = BackpropPSIM(
-        PSIM(regressor, n_future=2, features=features, n_iterations=1, belief_limit=np.inf),
+        PSIM(regressor, n_future=2, features=features, target=target, n_iterations=1, belief_limit=np.inf),
         loss=loss,
         truncation=truncation,  # of gradients; the loss is the same
     )
