@@ -56,7 +56,7 @@ class Recording:
     """How a data set enters the experiments.
 
     Attributes:
-        title: in tables. seed_column: its column in Table 3.3, or "".
+        title: in tables. thesis_column: its column in Table 3.3, or "".
         n_future: k, as in the thesis: 5, and 3 for videos.
         standardise: of the filters: components of one unit are scaled together.
         unit: of the squared errors.
