@@ -341,3 +341,17 @@ def test_it_is_a_scikit_learn_estimator():
     twice = clone(fitted).fit(train)
     np.testing.assert_array_equal(twice.beliefs(train), fitted.beliefs(train))
     assert BackpropPSIM(n_epochs=1).fit(turning(10)).belief_size == 10  # PSIM() has n_future=5
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("init", ["random", "dagger"])
+@each_regressor
+def test_training_on_cuda_gives_the_same_filter(regressor, init):
+    train = turning(lengths=LENGTHS)
+    psim = PSIM(regressor, n_future=2, n_iterations=1)
+    one, other = (
+        BackpropPSIM(psim, init=init, n_epochs=3, random_state=0, device=device).fit(train)
+        for device in ("cpu", "cuda")
+    )
+    np.testing.assert_allclose(one.history_["loss"], other.history_["loss"], rtol=1e-8)
+    np.testing.assert_allclose(one.beliefs(train), other.beliefs(train), rtol=0, atol=1e-6)
