@@ -23,7 +23,6 @@ from beliefgym.scripts.reproductions.psim_data import (
     ASSEMBLY,
     MOCAP,
     RECORDINGS,
-    VERSION,
     Recording,
     noisy_pendulum,
     parts,
@@ -55,7 +54,7 @@ def run(request: Request) -> Report:
                     "data": name,
                     "n": size,
                     "fold": fold,
-                    "data_version": VERSION,
+                    "data_version": SETTINGS[name].version,
                     "methods_version": methods.VERSION,
                 }
     paths = {"data": None if request.data is None else str(request.data)}

@@ -69,18 +69,27 @@ class Tuned:
 
 
 def tuned(make: Make, settings: Settings, train: Sequences, validation: Sequences) -> Tuned:
-    """Fit every setting and take the best."""
+    """Fit every setting and take the best; one that cannot be fitted, or does not stay finite, is out.
+
+    Raises:
+        ValueError: none is left.
+    """
     started = time.perf_counter()
     best: Tuned | None = None
+    reason: ValueError | None = None
     for setting in settings:
         began = time.perf_counter()
-        fitted = make(**setting).fit(train, validation)
+        try:
+            fitted = make(**setting).fit(train, validation)
+        except ValueError as refusal:
+            reason = refusal
+            continue
         seconds = time.perf_counter() - began
-        error = fitted.errors(validation).mean
-        if best is None or error < best.validation:
-            best = Tuned(fitted, setting, float(error), seconds, 0.0)
+        error = float(fitted.errors(validation).mean)
+        if np.isfinite(error) and (best is None or error < best.validation):
+            best = Tuned(fitted, setting, error, seconds, 0.0)
     if best is None:
-        raise ValueError("expected at least one setting")
+        raise ValueError(f"none of {settings} gives a filter that stays finite") from reason
     return Tuned(best.filter, best.setting, best.validation, best.seconds, time.perf_counter() - started)
 
 

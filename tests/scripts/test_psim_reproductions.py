@@ -295,3 +295,16 @@ def test_the_same_fold_gives_nested_training_sets(monkeypatch):
     )
     assert (len(few), len(many), len(every)) == (10, 20, 40)
     assert set(few) <= set(many)
+
+
+def test_settings_that_give_no_filter_are_left_out():
+    rng = np.random.default_rng(0)
+    train, validation = turning(5, 20, rng), turning(5, 20, rng)
+    best = psim_methods.tuned(
+        lambda k: AutoregressiveFilter(n_past=k, pad_start=False), [{"k": 100}, {"k": 3}], train, validation
+    )
+    assert best.setting == {"k": 3}
+    with pytest.raises(ValueError, match="none of"):
+        psim_methods.tuned(
+            lambda k: AutoregressiveFilter(n_past=k, pad_start=False), [{"k": 100}], train, validation
+        )
