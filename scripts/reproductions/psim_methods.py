@@ -32,6 +32,7 @@ from beliefgym.learning.subspace_identification import N4SID
 from beliefgym.scripts.reproductions.psim_data import Recording
 
 VERSION = 1  # of the grids; cells made with another one run again
+VERSIONS = {"gradient": 2}  # where a group's is another one
 ALPHAS = (1e-8, 1e-6, 1e-4, 1e-2, 1e-1, 1.0)  # a sample, standardised
 BANDWIDTHS = (0.5, 1.0, 2.0)  # times the square root of the number of inputs
 WAVES, SCREENED_WAVES = 300, 100  # random frequencies; of the settings that are only screened
@@ -41,8 +42,8 @@ HORIZON = 10  # observations ahead in Fig. 3.20
 RANKS = (2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50)
 STATES = (10, 20)  # of the Kalman filters
 EM_ITERATIONS = 40
-RANDOM_EPOCHS, FINE_EPOCHS = 100, 30  # of back-propagation from random starts, and after DAgger
-RANDOM_RATES, FINE_RATES = (1e-2,), (3e-4,)  # of 3e-5 .. 3e-2, on another split of arm and assembly
+RANDOM_EPOCHS, FINE_EPOCHS = 200, 30  # of back-propagation from random starts, and after DAgger
+RANDOM_RATES, FINE_RATES = (1e-2, 3e-2), (3e-4,)  # of 3e-5 .. 1e-1, on another split of arm and assembly
 WAVES_B, WAVES_EPOCHS = 100, 40  # of back-propagation with random features, which costs the most
 SIZES = (128,)  # of recurrent networks; of 64, 128 and 256 the best, on other splits of assembly and arm
 WITH_VARIANCE = ("PSIM-Linear_d, phi_2", "N4SID", "IVR", "Kalman, EM", "Kalman, MAP")
