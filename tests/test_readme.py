@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from beliefgym.learning import DataAsDemonstrator
+from beliefgym.learning import DataAsDemonstrator, load_filter
 from beliefgym.scripts.reproductions.dad_data import pendulum
 
 README = Path(__file__).parents[1] / "README.md"
@@ -100,3 +100,43 @@ def test_the_readmes_agent_acts_after_six_trials():
     exec(example, names)
     assert names["action"].shape == (1,)
     assert names["agent"].num_timesteps >= 360
+
+
+def blocks_of(path):
+    return re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
+
+
+@in_checkout
+def test_the_guide_to_filters_runs(tmp_path, monkeypatch):
+    """Every block in turn, on swings of a pendulum, and what they promise."""
+    monkeypatch.chdir(tmp_path)
+    blocks = blocks_of(README.parent / "docs" / "predictive-state-filters.md")
+    assert len(blocks) == 4
+    swings = pendulum(0, n=60, n_steps=60).observations
+    names: dict = {"array": swings, "live": swings[0][:, None]}
+    exec(blocks[0], names)
+    filter, test, belief = names["filter"], names["test"], names["belief"]
+    power = np.square(test.observations).sum(axis=2).mean()
+    assert filter.errors(test).mean < 1e-3 * power
+    assert filter.forecast(belief, 20).shape == (2, 20, 3)
+    exec(blocks[1], names)
+    assert names["belief"].shape == (1, filter.belief_size)
+    assert names["stream"].n_pairs > filter.history_["n_pairs"][-1]
+    names["belief"] = belief
+    exec(blocks[2], names)
+    loaded = load_filter("arm.safetensors")
+    np.testing.assert_array_equal(loaded.forecast(belief, 20), filter.forecast(belief, 20))
+    exec(blocks[3], names)
+    assert names["gaussian"].predict_variance(names["gaussian"].initial_belief(1)).shape == (1, 3)
+
+
+@in_checkout
+def test_the_readmes_filter_forecasts(tmp_path):
+    (example,) = (block for block in blocks_of(README) if "PSIM(" in block)
+    runs = pendulum(0, n=60, n_steps=60)
+    train, validation, test = runs.split((0.8, 0.1, 0.1), seed=0)
+    names: dict = {"train": train, "validation": validation, "test": test}
+    exec(example, names)
+    assert names["next_twenty"].shape == (1, 20, 3)
+    last = test.observations[0, -1]
+    assert np.abs(names["next_twenty"][0, 0] - last).max() < 0.5

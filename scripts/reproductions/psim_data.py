@@ -78,6 +78,11 @@ class Recording:
         """Whether it is one."""
         return self.n_future == 3
 
+    @property
+    def is_far(self) -> bool:
+        """Whether what is tested on is unlike what is trained on: other scenes of a video, other motions of the arm."""
+        return self.is_video or self is RECORDINGS[ARM]
+
 
 RECORDINGS = {
     ASSEMBLY: Recording(

@@ -130,10 +130,10 @@ def linear_group(
 def delta_group(
     recording: Recording, parts: tuple[Sequences, Sequences], seed: int
 ) -> Iterator[tuple[str, Tuned]]:
-    """The filters that hold on to the last observation (target "delta"); with random features on videos alone."""
+    """The filters that hold on to the last observation (target "delta"); random features where they matter most."""
     yield "AR-5, delta", tuned(_linear_autoregression(recording, target="delta"), RIDGES, *parts)
     yield "PSIM-Linear_d, delta", tuned(linear_psim(recording, target="delta"), RIDGES, *parts)
-    if recording.is_video:
+    if recording.is_far:
         autoregressive, psim = _makes_of_waves(recording, parts[0].n_obs, seed, "delta")
         yield "AR-5, RFF, delta", screened(autoregressive, recording, parts)
         yield "PSIM-RFF_d, delta", screened(psim(recording.n_future), recording, parts)
