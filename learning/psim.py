@@ -295,7 +295,8 @@ class PSIM(PredictiveStateFilter):
         learner: Learner | None = getattr(self, "_learner", None)
         if learner is None:
             raise ValueError(
-                "expected a PSIM that still holds its aggregate, got one from a file or a stream, which only filters; fit anew"
+                "expected a PSIM that still holds its aggregate, got one from a file or a stream, which only "
+                "filters; fit anew"
             )
         return learner
 

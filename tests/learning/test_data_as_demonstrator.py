@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from by_hand import RidgeOfAll
 from sklearn import linear_model
-from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.preprocessing import PolynomialFeatures
 
 from beliefgym.envs.pendulum import Pendulum
@@ -19,25 +19,6 @@ class Keeping(PolynomialRidge):
     def frozen(self):
         KEPT.append(super().frozen())
         return KEPT[-1]
-
-
-class RidgeOfAll(RegressorMixin, BaseEstimator):
-    """Scikit-learn's ridge with a penalty a sample: the same minimiser as `Ridge`, from stored data."""
-
-    def __init__(self, alpha=1e-3):
-        self.alpha = alpha
-
-    def fit(self, X, y):
-        self.ridge_ = linear_model.Ridge(alpha=len(X) * self.alpha, solver="svd").fit(X, y)
-        return self
-
-    def predict(self, X):
-        return self.ridge_.predict(X)
-
-    def __sklearn_tags__(self):
-        tags = super().__sklearn_tags__()
-        tags.target_tags.multi_output = True
-        return tags
 
 
 def oscillator(lengths=LENGTHS, n_act=0, seed=0, nonlinear=1.0):

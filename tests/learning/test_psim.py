@@ -4,10 +4,10 @@ import pickle
 
 import numpy as np
 import pytest
-from sklearn.base import BaseEstimator, RegressorMixin, clone
+from by_hand import RidgeOfAll, poison_empty
+from sklearn.base import clone
 from sklearn.ensemble import GradientBoostingRegressor
 from sklearn.linear_model import LinearRegression
-from sklearn.linear_model import Ridge as ScikitRidge
 from sklearn.neighbors import KNeighborsRegressor
 
 import beliefgym.learning.psim as psim_module
@@ -30,25 +30,6 @@ class Keeping(Ridge):
     def frozen(self):
         KEPT.append(super().frozen())
         return KEPT[-1]
-
-
-class RidgeOfAll(RegressorMixin, BaseEstimator):
-    """Scikit-learn's ridge with a penalty a sample: the same minimiser as `Ridge`, from stored data."""
-
-    def __init__(self, alpha=1e-3):
-        self.alpha = alpha
-
-    def fit(self, X, y):
-        self.ridge_ = ScikitRidge(alpha=len(X) * self.alpha, solver="svd").fit(X, y)
-        return self
-
-    def predict(self, X):
-        return self.ridge_.predict(X)
-
-    def __sklearn_tags__(self):
-        tags = super().__sklearn_tags__()
-        tags.target_tags.multi_output = True
-        return tags
 
 
 def saturating(n=None, n_steps=12, seed=0, lengths=None, noise=0.3):
@@ -472,15 +453,7 @@ def test_nothing_is_read_before_it_is_written(monkeypatch, name):
     train = saturating(lengths=LENGTHS + LENGTHS)
     model = clone(FILTERS[name]).set_params(n_future=2)
     clean = clone(model).fit(train, train)
-    plain = np.empty
-
-    def poisoned(shape, dtype=float, **others):
-        array = plain(shape, dtype, **others)
-        if array.dtype == np.float64:
-            array[...] = 1e200
-        return array
-
-    monkeypatch.setattr(np, "empty", poisoned)
+    poison_empty(monkeypatch)
     again = clone(model).fit(train, train)
     np.testing.assert_array_equal(again.history_["train_error"], clean.history_["train_error"])
     np.testing.assert_array_equal(again.errors(train, 4).squared, clean.errors(train, 4).squared)

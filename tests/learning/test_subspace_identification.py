@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from by_hand import eigenvalue_error, predictions
 from scipy.linalg import solve_discrete_are
 from sklearn.base import clone
 
@@ -40,18 +41,6 @@ def kalman(x, a=A, c=C, q=Q, r=R):
         rows.append(state @ c.T)
         state = state @ a.T + (x[:, t] - rows[-1]) @ gain.T
     return np.stack(rows, axis=1), a - gain @ c, s
-
-
-def predictions(model, data):
-    beliefs = model.beliefs(data)[:, :-1]
-    flat = model.predict_observation(beliefs.reshape(-1, beliefs.shape[2]))
-    return flat.reshape(*beliefs.shape[:2], -1)
-
-
-def eigenvalue_error(found, true):
-    """The largest distance from a true eigenvalue to the nearest found one."""
-    found, true = np.linalg.eigvals(found), np.linalg.eigvals(true)
-    return np.abs(found[:, None] - true).min(axis=0).max()
 
 
 def spectral_radius(matrix):
