@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -92,6 +93,16 @@ def tuned(make: Make, settings: Settings, train: Sequences, validation: Sequence
     if best is None:
         raise ValueError(f"none of {settings} gives a filter that stays finite") from reason
     return Tuned(best.filter, best.setting, best.validation, best.seconds, time.perf_counter() - started)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the warnings of settings that validation is there to sort out."""
+    with warnings.catch_warnings():
+        for kind in (DivergenceWarning, ConvergenceWarning):
+            warnings.simplefilter("ignore", kind)
+        warnings.filterwarnings("ignore", message="the filter of rank")
+        yield
 
 
 def linear_group(
@@ -301,12 +312,7 @@ def results(
 ) -> dict[str, Any]:
     """Tune every method of a group, and look at the test part."""
     found: dict[str, Any] = {}
-    with warnings.catch_warnings():
-        for kind in (DivergenceWarning, ConvergenceWarning):
-            warnings.simplefilter("ignore", kind)
-        warnings.filterwarnings(
-            "ignore", message="the filter of rank"
-        )  # validation chooses among ranks and ridges
+    with quiet():
         for name, one in GROUPS[group](recording, (train, validation), seed):
             errors = one.filter.errors(test, min(HORIZON, test.n_steps))
             found[name] = {
