@@ -126,7 +126,9 @@ def run(request: Request) -> Report:
         "seed": request.seed,
         "n_folds": N_FOLDS,
         "data_versions": {name: RECORDINGS[name].version for name in names},
-        "methods_versions": {group: methods.VERSIONS.get(group, methods.VERSION) for group in methods.GROUPS},
+        "methods_versions": {
+            f"{n}-{g}": _cell(n, g, 0, 0)["methods_version"] for n in names for g in methods.GROUPS
+        },
     }
     return Report(ABOUT, COLUMNS, rows, configuration, figures, notes)
 
@@ -178,7 +180,7 @@ def _cell(name: str, group: str, fold: int, seed: int) -> dict[str, Any]:
         "fold": fold,
         "seed": seed,
         "data_version": RECORDINGS[name].version,
-        "methods_version": methods.VERSIONS.get(group, methods.VERSION),
+        "methods_version": methods.VERSIONS.get((name, group), methods.VERSION),
     }
 
 

@@ -68,9 +68,8 @@ def small(monkeypatch):
         "RANKS": (2, 3),
         "STATES": (2,),
         "EM_ITERATIONS": 3,
-        "RANDOM_EPOCHS": 2,
         "FINE_EPOCHS": 1,
-        "WAVES_EPOCHS": 2,
+        "RANDOM_OF": {"Flag Video": (2, 2, (1e-2, 3e-2))},
         "SIZES": (4,),
     }
     for name, value in settings.items():
