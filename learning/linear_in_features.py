@@ -106,7 +106,9 @@ class LinearInFeatures(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def predict_features(self, features: Array) -> Array:
         """A' phi + b: (n, m) -> (n, d); no checks."""
-        return features @ self._weights + self._offset
+        predicted: Array = features @ self._weights
+        predicted += self._offset
+        return predicted
 
     def solve(self) -> Self:
         """Bring the coefficients up to what was accumulated."""
