@@ -63,6 +63,10 @@ class PredictiveStateFilter(Filter):
     def predict_variance(self, belief: ArrayLike) -> Array:
         """Variance of the next observation, (n, belief_size) -> (n, n_obs), in squared units.
 
+        E[x^2] - E[x]^2, of which a filter linear in (m, x) cannot carry the first: it takes the square of x. With
+        `PolynomialRidge(degree=2)` or `RandomFourierRidge` the variance is right on noisy data. Where data are nearly
+        free of noise it is a small difference of two regressions, and mostly error: see `calibration`.
+
         Raises:
             ValueError: a belief without second moments.
         """

@@ -35,7 +35,7 @@ PENDULUM = "pendulum"
 SIZES = {
     ASSEMBLY: (5, 15, 0),
     MOCAP: (5, 15, 0),
-    PENDULUM: (10, 30, 100, 300),
+    PENDULUM: (10, 30, 100, 300, 1000),
 }  # 0 for all there are
 PENDULUM_STEPS, PENDULUM_NOISE, N_TEST = 50, 0.1, 500
 SETTINGS = {**RECORDINGS, PENDULUM: Recording("noisy pendulum (simulated)", "", 5, True, "1")}

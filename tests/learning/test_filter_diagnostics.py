@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import norm
 from sklearn.exceptions import NotFittedError
 
-from beliefgym.learning import RandomFourierRidge, Ridge, Sequences
+from beliefgym.learning import PolynomialRidge, RandomFourierRidge, Ridge, Sequences
 from beliefgym.learning.autoregressive_filter import AutoregressiveFilter
 from beliefgym.learning.filter_diagnostics import (
     STEP,
@@ -250,6 +250,18 @@ def test_the_filter_of_the_system_is_calibrated(stationary):
     assert found.log_likelihood == pytest.approx(-expected, abs=0.02)
     assert found.constant_log_likelihood == pytest.approx(found.log_likelihood, abs=2e-3)
     assert found.n_without_variance == 0
+
+
+def test_second_moments_of_a_quadratic_filter_are_calibrated_and_those_of_a_linear_one_are_not():
+    """E[x^2] takes the square of the latest observation, which a filter linear in it has not."""
+    train, test = some_data(200, 50, 1), some_data(200, 50, 2)
+    coverage = {}
+    for regressor in (Ridge(), PolynomialRidge(degree=2)):
+        filter = PSIM(regressor, n_future=2, features="second", n_iterations=5).fit(train)
+        found = calibration(filter, test)
+        coverage[type(regressor)] = found.coverage
+    np.testing.assert_allclose(coverage[PolynomialRidge], found.nominal, atol=0.02)
+    assert coverage[Ridge][-1] < 0.9
 
 
 def test_log_likelihoods_are_those_of_scipys_normal_distribution():
