@@ -28,7 +28,7 @@ from beliefgym.scripts.reproductions.psim_data import (
     parts,
     present,
 )
-from beliefgym.scripts.reproductions.psim_figures import SHOWN
+from beliefgym.scripts.reproductions.psim_figures import SHOWN, numbers
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
 PENDULUM = "pendulum"
@@ -167,5 +167,7 @@ def _figure(path: Path, curves: dict[str, dict[str, list[tuple[float, Interval]]
             ax.set_xscale("log")
             ax.set_yscale("log")
             plain(ax, title, "training trajectories", "one-step error")
+            numbers(ax.xaxis, n)
+            numbers(ax.yaxis)
             ax.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=8)
         save(figure, path)

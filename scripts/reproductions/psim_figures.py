@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from beliefgym.scripts.reproductions.dad_figures import STYLE, plain, save
 from beliefgym.scripts.reproductions.psim_data import RECORDINGS
@@ -41,6 +44,21 @@ def recorded_figures(found: dict[str, Any], order: tuple[str, ...], folder: Path
     }
 
 
+def numbers(axis: Axis, places: Sequence[float] | None = None) -> None:
+    """Plain numbers on a logarithmic axis; where it has not a whole decade, on its minor ticks too.
+
+    Args:
+        axis: of a plot that is drawn. places: ticks; None leaves them.
+    """
+    low, high = axis.get_view_interval()
+    if places is not None:
+        axis.set_ticks(list(places))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    few = places is None and high / low < 10
+    axis.set_minor_locator(LogLocator(subs=(2, 4, 6) if few else (0.5,)) if places is None else NullLocator())
+    axis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}") if few else NullFormatter())
+
+
 def _look_ahead(found: dict[str, Any], names: list[str]) -> Figure:
     figure, axes = _grid(len(names), 3.1)
     for ax, name in zip(axes, names, strict=False):
@@ -58,6 +76,7 @@ def _look_ahead(found: dict[str, Any], names: list[str]) -> Figure:
         ax.set_yscale("log")
         ax.set_ylim(top=1.3)
         plain(ax, RECORDINGS[name].title, "look-ahead (steps)", "error / power")
+        numbers(ax.yaxis)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8)
     return figure
@@ -77,6 +96,7 @@ def _errors(found: dict[str, Any], names: list[str], order: tuple[str, ...]) -> 
         ax.set_yticks(range(len(methods)), list(reversed(methods)), fontsize=7.5)
         ax.set_xscale("log")
         plain(ax, RECORDINGS[name].title, "error / power", "")
+        numbers(ax.xaxis)
     return figure
 
 

@@ -7,6 +7,7 @@ methods is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,7 @@ CLAIMS = (
     (WAVES, "PSIM-RFF_d, k = 1", "Table 3.4"),
     ("PSIM-Linear_d, phi_2", LINEAR, "Table 3.5"),
 )
+LAST = ((LINEAR, "AR-5"), (LINEAR, "GRU"), (WAVES, "GRU"))  # compared at the longest look-ahead too
 NO_WORSE = 1.005  # a geometric mean ratio that still counts as no worse
 COLUMNS = ("what", "error", "median", "share of power", "fit, s", "thesis", "ratio", "meets")
 
@@ -223,19 +225,31 @@ def _rows(name: str, found: dict[str, dict[int, dict[str, Any]]]) -> list[Row]:
                 "meets": None,
             }
         )
-    return rows + [
-        row for claim in CLAIMS if (row := _claim(recording.title, recording.thesis_column, found, *claim))
-    ]
+    title, column = recording.title, recording.thesis_column
+    rows += [row for claim in CLAIMS if (row := _claim(title, column, found, *claim))]
+    last = f"{title}, {methods.HORIZON} steps ahead"
+    rows += [row for pair in LAST if (row := _claim(last, column, found, *pair, "", _at_the_horizon))]
+    return rows
+
+
+def _at_the_horizon(one: dict[str, Any]) -> float:
+    return float(one["by_look_ahead"][-1])
 
 
 def _claim(
-    title: str, column: str, found: dict[str, dict[int, dict[str, Any]]], better: str, worse: str, claim: str
+    title: str,
+    column: str,
+    found: dict[str, dict[int, dict[str, Any]]],
+    better: str,
+    worse: str,
+    claim: str,
+    error: Callable[[dict[str, Any]], float] = lambda one: one["test"],
 ) -> Row | None:
-    """A paired comparison over the folds that both have."""
+    """A paired comparison over the folds that both have, of an error that a result holds."""
     both = sorted(set(found.get(better, {})) & set(found.get(worse, {})))
     if not both:
         return None
-    log = Interval.of([np.log(found[better][f]["test"] / found[worse][f]["test"]) for f in both])
+    log = Interval.of([np.log(error(found[better][f]) / error(found[worse][f])) for f in both])
     mean, low, high = (float(np.exp(v)) for v in (log.mean, log.low, log.high))
     ratio = Interval(mean, low, high, log.n)
     if claim == "Table 3.4":
