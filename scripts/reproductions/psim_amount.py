@@ -167,7 +167,7 @@ def _figure(path: Path, curves: dict[str, dict[str, list[tuple[float, Interval]]
             ax.set_xscale("log")
             ax.set_yscale("log")
             plain(ax, title, "training trajectories", "one-step error")
-            numbers(ax.xaxis, n)
+            numbers(ax.xaxis, np.round(n))
             numbers(ax.yaxis)
             ax.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=8)
         save(figure, path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from numpy.typing import ArrayLike
 
 from beliefgym.scripts.reproductions.dad_figures import STYLE, plain, save
 from beliefgym.scripts.reproductions.psim_data import RECORDINGS
@@ -44,17 +44,17 @@ def recorded_figures(found: dict[str, Any], order: tuple[str, ...], folder: Path
     }
 
 
-def numbers(axis: Axis, places: Sequence[float] | None = None) -> None:
-    """Plain numbers on a logarithmic axis; where it has not a whole decade, on its minor ticks too.
+def numbers(axis: Axis, places: ArrayLike | None = None) -> None:
+    """Plain numbers on a logarithmic axis; where it spans little, on minor ticks too.
 
     Args:
         axis: of a plot that is drawn. places: ticks; None leaves them.
     """
     low, high = axis.get_view_interval()
     if places is not None:
-        axis.set_ticks(list(places))
+        axis.set_ticks(np.asarray(places))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    few = places is None and high / low < 10
+    few = places is None and high / low < 30
     axis.set_minor_locator(LogLocator(subs=(2, 4, 6) if few else (0.5,)) if places is None else NullLocator())
     axis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}") if few else NullFormatter())
 
