@@ -31,7 +31,8 @@ from beliefgym.learning.dynamics import DivergenceWarning
 from beliefgym.learning.filters import check_whole
 from beliefgym.learning.linear_in_features import LinearInFeatures, Ridge
 from beliefgym.learning.predictive_state import PredictiveStateFilter, TrainingData
-from beliefgym.learning.psim import PSIM, history_pairs
+from beliefgym.learning.psim import PSIM
+from beliefgym.learning.psim_pairs import history_pairs
 from beliefgym.learning.random_fourier import RandomFourierRidge
 from beliefgym.learning.sequences import Sequences
 from beliefgym.learning.stochastic_gradient import RANDOM_SCALE, Parameters

@@ -179,7 +179,7 @@ def test_a_psim_that_started_from_its_prior_is_saved(tmp_path):
     train = some_data()
     filter = PSIM(n_future=2, n_iterations=1, init="prior").fit(train)
     filter.model_ = pickle.loads(pickle.dumps(filter.model_))
-    from beliefgym.learning.psim import Constant
+    from beliefgym.learning.psim_pairs import Constant
 
     filter.model_ = Constant(np.arange(6.0))  # as where no iteration is better than F_0
     loaded = load_filter(filter.save(tmp_path / "f"))

@@ -11,6 +11,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.neighbors import KNeighborsRegressor
 
 import beliefgym.learning.psim as psim_module
+import beliefgym.learning.psim_pairs as pairs_module
 from beliefgym.learning.kalman_filter import KalmanFilter
 from beliefgym.learning.linear_gaussian import LinearGaussianSystem
 from beliefgym.learning.linear_in_features import Ridge
@@ -253,7 +254,7 @@ def test_how_many_pairs_wait_for_the_aggregate_does_not_matter(monkeypatch, n_ke
     train = saturating(lengths=LENGTHS)
     model = PSIM(regressor, n_future=2, n_iterations=3)
     at_once = clone(model).fit(train)
-    monkeypatch.setattr(psim_module, "BUFFERED", n_kept)
+    monkeypatch.setattr(pairs_module, "BUFFERED", n_kept)
     in_pieces = clone(model).fit(train)
     np.testing.assert_allclose(in_pieces.beliefs(train), at_once.beliefs(train), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(in_pieces.history_["n_pairs"], at_once.history_["n_pairs"])
