@@ -79,7 +79,7 @@ def test_a_checkout_without_its_links_says_so(tmp_path):
 def test_every_public_name_is_there_and_documented():
     for folder in FOLDERS[:4]:
         module = __import__(f"beliefgym.{folder}", fromlist=["__all__"])
-        assert list(module.__all__) == sorted(module.__all__)
+        assert list(module.__all__) == sorted(module.__all__, key=lambda name: (not name.isupper(), name))
         for name in module.__all__:
             thing = getattr(module, name)
             assert (thing.__doc__ or "").strip(), f"beliefgym.{folder}.{name} has no docstring"
