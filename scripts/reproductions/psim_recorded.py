@@ -149,8 +149,8 @@ NOTES = [
     "worse`. The interval says whether that is more than chance. Rows without a claim have none.",
     "`delta`: the filters whose regression is of the change from the last observation, so that ridges hold on to it.",
     "Decided after first results had been seen: the failed assembly trial is left out, two families of the arm are not "
-    "held out together (linear filters were far off on both), target `delta` exists because of the pumpjack, and on motion "
-    "capture random starts have more epochs and a second rate, which fold 0's test error called for.",
+    "held out together (linear filters were far off on both), target `delta` exists because of the pumpjack, and on "
+    "motion capture random starts have more epochs and a second rate, which fold 0's test error called for.",
     "Folds share training data, so that the intervals are somewhat too narrow.",
     "`fit, s`: seconds of the chosen setting's fit alone on one thread, while another process ran: an order of "
     "magnitude. `beliefgym benchmark filter` measures speed.",
