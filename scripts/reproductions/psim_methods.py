@@ -46,7 +46,7 @@ EM_ITERATIONS = 40
 FINE_EPOCHS, FINE_RATES = 30, (3e-4,)  # of back-propagation after DAgger; of 3e-5 .. 3e-2, on other splits
 WAVES_B = 100  # random frequencies of back-propagation, which costs the most
 # Of back-propagation from random starts: epochs, epochs with random features, rates. Of 3e-3 .. 1e-1 on other splits;
-# 3e-2 diverges on assembly and arm. On motion capture it pays: that, and its epochs, were chosen by fold 0's test error,
+# 3e-2 diverges on assembly and arm. On motion capture it pays; that and its epochs were chosen by fold 0's test error,
 # in the rival's favour. The flag has 1200 windows.
 RANDOM = 100, 40, (1e-2,)
 RANDOM_OF: dict[str, tuple[int, int, tuple[float, ...]]] = {
