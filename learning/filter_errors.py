@@ -35,25 +35,25 @@ class FilterErrors:
     @property
     def by_episode(self) -> Array:
         """(n_episodes,) mean over t from 1, one observation ahead; NaN for an episode of one observation."""
-        return _mean(self.squared[:, 1:, 0], 1)
+        return nan_mean(self.squared[:, 1:, 0], 1)
 
     @property
     def mean(self) -> float:
         """e, of Table 3.3."""
-        return float(_mean(self.by_episode, 0))
+        return float(nan_mean(self.by_episode, 0))
 
     @property
     def by_look_ahead(self) -> Array:
         """(horizon,) the same for each look-ahead, of Fig. 3.20."""
-        return _mean(_mean(self.squared[:, 1:], 1), 0)
+        return nan_mean(nan_mean(self.squared[:, 1:], 1), 0)
 
     @property
     def by_time(self) -> Array:
         """(n_steps + 1,) mean over episodes after t = 0, 1, .. observations, one observation ahead."""
-        return _mean(self.squared[:, :, 0], 0)
+        return nan_mean(self.squared[:, :, 0], 0)
 
 
-def _mean(values: Array, axis: int) -> Array:
+def nan_mean(values: Array, axis: int) -> Array:
     """The mean of what is there; NaN, without a warning, of nothing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
