@@ -4,8 +4,8 @@
 
 with h_hat_t estimated from x_0 .. x_t: the estimate may use the observation made at the same time.
 
-The thesis calls this "mean L2 error" and prints the squared norm. Its Table 3.8 shows that the norm itself is meant: its
-filter that knows nothing (Linear KF) has 89 there, the standard deviation in grams of masses spread over 45 .. 355 g.
+The thesis calls this "mean L2 error" and prints the squared norm. Its Table 3.8 shows that the norm is meant: the
+filter that learns nothing there (Linear KF) has 89, the standard deviation in grams of masses spread over 45 .. 355 g.
 
 Reference: thesis proposal, Sec. 3.4.3, Tables 3.6 to 3.8 and Fig. 3.24.
 """
