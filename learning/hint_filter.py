@@ -53,6 +53,7 @@ class HintFilter(Filter):
         prior_mean_, prior_std_: (n_hint,) of the training data's first hints, what is known before any observation.
     """
 
+    hints_from: Literal["hints", "states"] = "hints"  # the trajectories' array that holds them
     n_hint_: int
     hint_names_: tuple[str, ...] | None = None
     prior_mean_: Array
@@ -152,7 +153,8 @@ class HintFilter(Filter):
         self.__dict__.pop("n_hint_", None)
         hints = self._hints_of(train, "training trajectories")
         rows = hints[train.observation_mask]
-        self.n_hint_, self.hint_names_ = train.hints.shape[2], train.hint_names  # type: ignore[union-attr]
+        self.n_hint_ = hints.shape[2]
+        self.hint_names_ = train.hint_names if self.hints_from == "hints" else train.state_names
         if validation is not None:
             self._hints_of(validation, "validation")
         self._hint_scale = STANDARDISATIONS[self.standardise](rows)
@@ -164,18 +166,27 @@ class HintFilter(Filter):
                 f"hints {told} do not vary in the training data: nothing can be learned of them", stacklevel=3
             )
 
+    def _rows(self, sequences: Sequences) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Every m_{t+1} of trajectories, h_t standardised, and the trajectory of each."""
+        mask = sequences.observation_mask
+        hints = self._hint_scale.apply(self._hints_of(sequences, "trajectories"))
+        return self.beliefs(sequences)[:, 1:][mask], hints[mask], np.nonzero(mask)[0]
+
     def _hints_of(self, sequences: Sequences, what: str) -> Array:
         """(n_episodes, n_steps + 1, n_hint), NaN past an episode's end."""
-        if sequences.hints is None:
+        if self.hints_from not in ("hints", "states"):
+            raise ValueError(f"expected hints_from to be 'hints' or 'states', got {self.hints_from!r}")
+        hints: Array | None = getattr(sequences, self.hints_from)
+        if hints is None:
             raise ValueError(
-                f"expected {what} with hints, got {sequences!r}; pass hints=.. to Sequences, or collect from an "
-                "environment made with hint=True"
+                f"expected {what} with {self.hints_from}, got {sequences!r}; pass {self.hints_from}=.. to Sequences, "
+                "or collect from an environment made with hint=True"
             )
-        if hasattr(self, "n_hint_") and sequences.hints.shape[2] != self.n_hint_:
+        if hasattr(self, "n_hint_") and hints.shape[2] != self.n_hint_:
             raise ValueError(
-                f"expected {what} with {self.n_hint_} hints as in training, got {sequences.hints.shape[2]}"
+                f"expected {what} with {self.n_hint_} hints as in training, got {hints.shape[2]}"
             )
-        return np.where(sequences.observation_mask[:, :, None], sequences.hints, np.nan)
+        return np.where(sequences.observation_mask[:, :, None], hints, np.nan)
 
 
 def check_observed(x: Array, missing: Missing) -> None:

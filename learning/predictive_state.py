@@ -103,32 +103,41 @@ class PredictiveStateFilter(Filter):
             ValueError: parameters out of range; not one trajectory of k + 1 observations.
         """
         check_whole("n_future", self.n_future, 1)
-        if not self.belief_limit > 0:
-            raise ValueError(f"expected belief_limit above 0, got {self.belief_limit!r}")
         if self.target not in get_args(Target):
             raise ValueError(f"expected target to be one of {get_args(Target)}, got {self.target!r}")
-        if isinstance(train, Sequences) and train.n_transitions:
-            short = self._n_targets(train) < 2
-            if short.any():
-                warnings.warn(
-                    f"{short.sum()} of {len(train)} trajectories have fewer than n_future + 1 = "
-                    f"{self.n_future + 1} observations: nothing is learned from them",
-                    stacklevel=3,
-                )
-                train = train[~short]
+        train = self._long_enough(train, f"n_future + 1 = {self.n_future + 1}")
         self._begin(train, validation)
         z, n_targets = self._scale.apply(train.observations), self._n_targets(train)
         futures = cut_futures(z, self.n_future)
         complete = np.arange(futures.shape[1]) < n_targets[:, None]
         self._phi: FutureFeatures = future_features(self.features, futures[complete])
         data = self._training_data(train)
+        self._begin_beliefs(data)
+        return data
+
+    def _long_enough(self, train: Sequences, needed: str) -> Sequences:
+        """The trajectories that something can be learned from; the others are told."""
+        if not self.belief_limit > 0:
+            raise ValueError(f"expected belief_limit above 0, got {self.belief_limit!r}")
+        if not isinstance(train, Sequences) or not train.n_transitions:
+            return train  # which `_begin` refuses
+        short = self._n_targets(train) < 2
+        if short.any():
+            warnings.warn(
+                f"{short.sum()} of {len(train)} trajectories have fewer than {needed} observations: nothing is learned "
+                "from them",
+                stacklevel=4,
+            )
+        return train[~short]
+
+    def _begin_beliefs(self, data: TrainingData) -> None:
+        """The initial belief and the bounds."""
         self._first_belief = data.targets[:, 0].mean(axis=0)
         rows = data.targets[np.arange(data.targets.shape[1]) < data.n_targets[:, None]]
         largest = np.abs(rows).max(axis=0)
         # where a feature does not vary, its largest value may be rounding: no bound of that size
         still = Standardisation.of(rows).constant | (self.standardise is True)
         self._bound = self.belief_limit * np.where(still, np.maximum(largest, 1.0), largest)
-        return data
 
     def _training_data(self, sequences: Sequences) -> TrainingData:
         z, base = self._scale.apply(sequences.observations), None
@@ -194,7 +203,7 @@ class PredictiveStateFilter(Filter):
             predicted[:, step] = self._phi.read_last(self._state(belief))
         return predicted
 
-    def _next_error(self, sequences: Sequences) -> float:
+    def _history_error(self, sequences: Sequences) -> float:
         """The error that the histories hold: see `mean_next_error`."""
         z = self._standardised(sequences)
         beliefs = np.empty((*z.shape[:2], self.belief_size))

@@ -151,12 +151,9 @@ class PSIM(PredictiveStateFilter):
             if learner is not None and self.discount < 1:
                 learner.discount(self.discount)
             beliefs, n_bounded = self._filter(data, pairs)
-            self._learn_to_read(beliefs, data.z, data.n_targets)
-            self._note(
-                n, iteration=n, n_bounded=n_bounded, train_error=self._error_of(beliefs, data.z, data.lengths)
-            )
+            self._note(n, iteration=n, n_bounded=n_bounded, train_error=self._training_error(beliefs, data))
             if validation is not None:
-                self._note(n, validation_error=self._next_error(validation))
+                self._note(n, validation_error=self._history_error(validation))
             criterion = self.history_["train_error" if validation is None else "validation_error"][n]
             if criterion < best or n == 0:
                 best, self.best_iteration_, chosen = criterion, n, (self.model_, copy(self._phi))
@@ -276,6 +273,11 @@ class PSIM(PredictiveStateFilter):
             beliefs[rows, t + 1] = following
         pairs.flush()
         return beliefs, n_bounded
+
+    def _training_error(self, beliefs: Array, data: TrainingData) -> float:
+        """The error that the history holds, of beliefs met in training; learns to read them first where need be."""
+        self._learn_to_read(beliefs, data.z, data.n_targets)
+        return self._error_of(beliefs, data.z, data.lengths)
 
     def _note(self, n: int, **values: float) -> None:
         for name, value in values.items():

@@ -144,7 +144,7 @@ class BackpropPSIM(PredictiveStateFilter):
                 self._learn_to_read(self.beliefs(data.sequences)[:, :-1], data.z, data.n_targets)
             criterion = -float(epoch)
             if validation is not None:
-                criterion = self.history_["validation_error"][epoch] = self._next_error(validation)
+                criterion = self.history_["validation_error"][epoch] = self._history_error(validation)
             if criterion < best:
                 best, self.best_epoch_, chosen = criterion, epoch, (self.model_, copy(self._phi))
             self.history_["seconds"][epoch] = time.perf_counter() - started
