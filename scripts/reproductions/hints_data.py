@@ -35,8 +35,8 @@ from beliefgym.learning import Sequences
 from beliefgym.scripts.reproductions.psim_data import Parts, split
 
 Floats = NDArray[np.float64]
-DAMPING, PENDULUM_DT, PENDULUM_STEPS = 0.3, 0.05, 99
-START_ANGLE, START_SPEED = 2.8, 1.0
+DAMPING, PENDULUM_DT, PENDULUM_STEPS = 0.0, 0.05, 99
+START_ANGLE, START_SPEED = 0.9 * np.pi, 1.0
 N_PENDULUMS, N_FLIGHTS, N_LIFTS = 200, 100, 200
 FLIGHT_STEPS = 299
 GRAMS = 1000.0
@@ -79,7 +79,7 @@ class Noise:
     observation: float
 
 
-CLEAN, NOISY = Noise((0.01, 0.05), 0.01), Noise((0.02, 0.1), 0.1)
+CLEAN, NOISY = Noise((0.01, 0.01), 0.01), Noise((0.01, 0.01), 0.1)
 
 
 def present(name: str, folder: Path | None) -> bool:
