@@ -1,4 +1,11 @@
-"""Physical systems, their Gymnasium environments and registration."""
+"""Physical systems, their Gymnasium environments and registration.
+
+The state estimators are imported when one is asked for: they are filters of `beliefgym.learning`, which need
+scikit-learn.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from beliefgym.envs.baxter import BaxterReach
 from beliefgym.envs.baxter_hand import BaxterReachHand
@@ -28,12 +35,20 @@ from beliefgym.envs.system import System
 from beliefgym.envs.true_state import TrueState
 from beliefgym.envs.vector_env import SystemVectorEnv
 
+if TYPE_CHECKING:
+    from beliefgym.envs.estimators.complementary import ComplementaryFilter
+    from beliefgym.envs.estimators.extended import ExtendedKalmanFilter
+    from beliefgym.envs.estimators.particle import ParticleFilter
+    from beliefgym.envs.estimators.unscented import UnscentedKalmanFilter
+
 __all__ = [
     "BaxterReach",
     "BaxterReachHand",
     "CartPole",
     "CartPoleBalance",
+    "ComplementaryFilter",
     "DoublePendulum",
+    "ExtendedKalmanFilter",
     "HalfCheetahEnv",
     "Helicopter",
     "HelicopterCompetition",
@@ -44,6 +59,7 @@ __all__ = [
     "MobileBase",
     "MobileBaseKinematic",
     "NonFiniteError",
+    "ParticleFilter",
     "Pendulum",
     "Quadrotor",
     "SwimmerEnv",
@@ -51,6 +67,7 @@ __all__ = [
     "SystemEnv",
     "SystemVectorEnv",
     "TrueState",
+    "UnscentedKalmanFilter",
     "Walker2dEnv",
     "collect",
     "register_all",
@@ -58,3 +75,23 @@ __all__ = [
     "register_system",
     "registered_ids",
 ]
+
+_ESTIMATORS = {
+    "ComplementaryFilter": "complementary",
+    "ExtendedKalmanFilter": "extended",
+    "ParticleFilter": "particle",
+    "UnscentedKalmanFilter": "unscented",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the module of an estimator when its name is first asked for."""
+    if name not in _ESTIMATORS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.estimators.{_ESTIMATORS[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_ESTIMATORS])
