@@ -227,7 +227,8 @@ class ComplementaryFilter(HintFilter):
             return nan_mean(nan_mean(norm, 0), 1)
 
         grid = np.array(list(every_pair(*(GRIDS[name] for name in free))))
-        start = np.log(grid[np.argmin(errors(grid))])
+        found_by_grid = errors(grid)
+        start = np.log(grid[np.argmin(found_by_grid)])
         found = minimize(
             lambda logs: errors(np.exp(logs)[None])[0],
             start,
@@ -235,7 +236,7 @@ class ComplementaryFilter(HintFilter):
             options={
                 "maxfev": REFINEMENTS * len(free),
                 "xatol": 1e-2,
-                "fatol": 1e-6,
+                "fatol": 1e-4 * float(found_by_grid.min()),
                 "initial_simplex": start + 0.7 * np.eye(len(free) + 1, len(free), -1),
             },
         )

@@ -28,7 +28,7 @@ from beliefgym.envs.estimators.physics_setup import (
     checked_parameters,
     checked_prior,
     columns_of,
-    first_states,
+    empirical_prior,
 )
 from beliefgym.envs.system import System
 from beliefgym.learning.dynamics import Standardise
@@ -70,7 +70,8 @@ class PhysicsFilter(HintFilter):
         observation_noise_std: of the white noise on each, above 0, in their units; one number or one each.
         hint: "hint" for `system.hint(state)`, or names of state components.
         prior: mean (n_state,) and covariance (n_state, n_state) of s_0. None to take those of the first states of the
-            training data: from `states`, or from `hints` where the hint is the whole state.
+            training data: from `states`, or from `hints` where the hint is the whole state. It takes several times
+            as many trajectories as the state has components, or the filter believes correlations of chance.
 
     Attributes:
         prior_: the prior of s_0, a `StateEstimate` of one row. prior_mean_, prior_std_: of the hint, by the prior.
@@ -134,11 +135,7 @@ class PhysicsFilter(HintFilter):
         if self.prior is not None:
             mean, covariance = checked_prior(self.prior, self.system)
         else:
-            states = first_states(train, self.system)
-            mean, covariance = (
-                states.mean(axis=0),
-                np.cov(states.T, bias=True).reshape(2 * (states.shape[1],)),
-            )
+            mean, covariance = empirical_prior(train, self.system)
         self._use(setting, mean, covariance)
         return self
 

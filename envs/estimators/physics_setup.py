@@ -1,7 +1,8 @@
-"""What a filter of a known system is told, checked: names, noise, hint, prior, and first states of data."""
+"""What a filter of a known system is told, checked: names, noise, hint, and prior."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -97,8 +98,10 @@ def checked_prior(prior: Any, system: System) -> tuple[Array, Array]:
     return mean, covariance
 
 
-def first_states(train: Sequences, system: System) -> Array:
-    """(n_episodes, n_state) s_0 of trajectories, from their states or from hints that are the whole state.
+def empirical_prior(train: Sequences, system: System) -> tuple[Array, Array]:
+    """Mean and covariance of s_0 over trajectories, from their states or from hints that are the whole state.
+
+    Warns where there are too few trajectories for a covariance of full rank.
 
     Raises:
         ValueError: there are none, they have other components than the system's, or there is one trajectory only.
@@ -117,7 +120,16 @@ def first_states(train: Sequences, system: System) -> Array:
         )
     if len(states) < 2:
         raise ValueError(f"expected at least 2 training trajectories for a prior, got {len(states)}{advice}")
-    return np.asarray(states[:, 0])
+    first = states[:, 0]
+    covariance = np.cov(first.T, bias=True).reshape(len(expected), len(expected))
+    varying = int(np.count_nonzero(np.diag(covariance)))
+    if len(first) <= varying:
+        warnings.warn(
+            f"the prior covariance of {varying} state components comes from {len(first)} trajectories: it is singular, "
+            f"and the filter believes its correlations of chance{advice}",
+            stacklevel=3,
+        )
+    return first.mean(axis=0), covariance
 
 
 def additive_variance(system: System) -> Array | None:

@@ -41,8 +41,9 @@ class UnscentedKalmanFilter(GaussianPhysicsFilter):
     Args:
         system, observation_noise_std, observed, hint, prior: as of `PhysicsFilter`.
         alpha: spread of the points, above 0. At 1 a point's distance is that of the plain transform; a small one makes
-            it a linearisation, with a large negative weight in the middle.
-        beta: what is added to the middle point's weight in covariances; at least alpha^2 - 1 or so.
+            it a linearisation, with a large negative weight in the middle. Points lie alpha sqrt(d + kappa) deviations
+            away, which for a state of dozens of components may be too far for what they are to describe.
+        beta: what is added to the middle point's weight in covariances. Van der Merwe has 2, with a small alpha.
         kappa: None for max(3 - d, 0), d the number of state (and noise) components. With beta = 0, kappa = 3 - d has
             the fourth moments of a Gaussian, but a negative weight for d > 3, with which covariances can stop being
             positive. So there it is 0, the cubature rule, whose weights are never negative.

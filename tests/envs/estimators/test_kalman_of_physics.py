@@ -288,22 +288,32 @@ def test_a_known_component_of_the_start_stays_known(kind):
     assert np.isfinite(estimator.estimate_hints(data).mean).all()
 
 
-@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+@kinds
 def test_it_keeps_quaternions_and_estimates_the_attitude_of_a_quadrotor(kind):
-    system = Quadrotor()
-    streams = RandomStreams(np.random.default_rng(0).integers(2**32, size=12).astype(np.uint64))
-    start = system.initial_state(streams)
+    """28 state components, noise of the wind and of a bias that enters the step, and a hint that the system computes.
+
+    The start is spread little enough for the equations to be nearly linear; then the given deviations are right."""
+    system = Quadrotor(
+        start_tilt=0.1, start_yaw=0.15, max_mean_wind=1.2, gust_std=0.3, start_rate=0.15, start_speed=0.15
+    )
+    seeds = np.random.default_rng(0).integers(2**32, size=5000).astype(np.uint64)
+    start = system.initial_state(RandomStreams(seeds))
     names = ("gyro_x", "gyro_y", "gyro_z", "accelerometer_x", "accelerometer_y", "accelerometer_z")
     names += ("position_x", "position_y", "position_z")
     std = np.repeat([0.01, 0.2, 0.002], 3)
-    data = simulated(system, start, np.zeros((12, 40, 4)), std, np.random.default_rng(1), names)
-    estimator = kind(system=system, observed=names, observation_noise_std=tuple(std)).fit(data)
+    data = simulated(system, start[:50], np.zeros((50, 40, 4)), std, np.random.default_rng(1), names)
+    estimator = kind.of(
+        system,
+        prior=(start.mean(axis=0), np.cov(start.T)),
+        observed=names,
+        observation_noise_std=tuple(std),
+    )
     belief = estimator.beliefs(data)[:, -1]
     norm = np.linalg.norm(estimator.estimate_state(belief).mean[:, 6:10], axis=1)
     np.testing.assert_allclose(norm, 1.0, atol=1e-12)
     errors = estimator.hint_errors(data)
-    assert errors.by_time[-1] < 0.5 * errors.by_time[0]
-    assert errors.by_time[-1] < 0.05
+    assert errors.by_time[-1] < 0.2 * errors.by_time[0]
+    assert (np.abs(errors.mean_squared_z - 1.0) < 0.5).all()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -413,6 +423,8 @@ def test_what_is_wrong_is_told(kind):
     fresh = kind(system=Linear(), observation_noise_std=SENSOR)
     with pytest.raises(ValueError, match=r"with the observations \('first', 'second'\)"):
         fresh.fit(swapped)
+    with pytest.warns(UserWarning, match="2 state components comes from 2 trajectories: it is singular"):
+        fresh.fit(data[:2])
     with pytest.raises(ValueError, match="at least 2 training trajectories"):
         fresh.fit(data[[0]])
     odd = Sequences.from_observations(data.observations, actions=data.actions, states=data.states[..., :1])
