@@ -207,12 +207,14 @@ def test_without_observations_the_estimate_is_the_pure_prediction():
     assert (std[8] < std[7]).all()
 
 
-def test_a_missing_component_leaves_the_exact_posterior_of_the_others():
-    data = with_units(sampled(20))
+def test_missing_components_leave_the_exact_posterior_of_the_others():
+    noise = np.array([[0.5, 0.3, -0.2], [0.3, 0.4, 0.1], [-0.2, 0.1, 0.6]])
+    system = LinearGaussianSystem(A, np.vstack([C, [0.3, 0.3, 0.3]]), Q, noise, **START)
+    data = sampled(20, system=system)
     fitted = KalmanHints(**PLAIN).fit(data)
     x = data.observations[:6].copy()
     x[np.random.default_rng(0).random(x.shape) < 0.4] = np.nan
-    x[1, 0], x[2, 0] = np.nan, [np.nan, 3.0]  # from the first observation on
+    x[1, 0], x[2, 0] = np.nan, [np.nan, 3.0, 1.0]  # from the first observation on
     belief, found = fitted.initial_belief(6), []
     for t in range(31):  # all at once, each with its own gaps
         belief = fitted.update(belief, x[:, t], missing="predict")
