@@ -132,11 +132,12 @@ class FromBelief(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """The regressor that reads the hint's first moment, which is part of the belief, and learns nothing.
 
     Args:
-        phi: the features.
+        phi: the features. weight: what the hint was multiplied by.
     """
 
-    def __init__(self, phi: HintMoments) -> None:
+    def __init__(self, phi: HintMoments, weight: float = 1.0) -> None:
         self.phi = phi
+        self.weight = weight
 
     def fit(self, X: Array, y: Array) -> FromBelief:
         """Nothing to do."""
@@ -144,7 +145,7 @@ class FromBelief(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def predict_unchecked(self, X: Array) -> Array:
         """(n, size) -> (n, hint_size)."""
-        return self.phi.read_hint(X)
+        return self.phi.read_hint(X) / self.weight
 
     predict = predict_unchecked
 

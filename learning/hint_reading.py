@@ -38,6 +38,7 @@ PENALTIES = (
     0.01,
 )  # a sample, of standardised features; of the variance, beside a constant one
 SMALLEST = 1e-6  # of the mean squared residual: what is added to each before the logarithm
+LEAST_SQUARED = np.finfo(float).eps ** 2  # of standardised residuals: below it they are rounding
 CLIPPED = 3.0  # standard deviations at which the features of the variance stop
 
 
@@ -115,6 +116,7 @@ class ResidualVariance:
         Args:
             rows: (n, size) beliefs. squared: (n, d). episode: (n,) the trajectory of each.
         """
+        squared = np.maximum(squared, LEAST_SQUARED)
         features = np.concatenate([rows, np.square(rows)], axis=1)
         self.centre, spread = features.mean(axis=0), features.std(axis=0)
         self.spread = np.where(spread > 0, spread, 1.0)

@@ -69,6 +69,11 @@ class PSIMHints(PSIM, HintFilter):
             "belief" to read the hint's first moment off the belief; None for the choice between `Ridge` and
             `RandomFourierRidge`.
         hints_from: the trajectories' array that holds the hints, "hints" or "states".
+        pad_end: take an episode's last observation and hint for those after its end, so that something is learned from
+            every step: for episodes of a few k steps that all go through the same phases, whose last one would else be
+            left out. False learns from complete futures alone.
+        hint_weight: scale of the standardised hints in a belief, against 1 of the observations. Regressors that measure
+            distances (random Fourier features) see a hint among many observations better where it is above 1.
         n_iterations, init, discount, algorithm, step_size, standardise, belief_limit, progress_bar: as of `PSIM`. Hints
             are standardised as the observations are, by themselves.
         n_past: observations of the history of `init`; None for 2 max(k, 5).
@@ -98,6 +103,8 @@ class PSIMHints(PSIM, HintFilter):
         features: HintFeatures = "first",
         preimage: Preimage = None,
         hints_from: Literal["hints", "states"] = "hints",
+        pad_end: bool = False,
+        hint_weight: float = 1.0,
         n_iterations: int = 20,
         init: Init = "history",
         n_past: int | None = None,
@@ -110,6 +117,8 @@ class PSIMHints(PSIM, HintFilter):
     ) -> None:
         self.regressor = regressor
         self.n_future = n_future
+        self.pad_end = pad_end
+        self.hint_weight = hint_weight
         self.n_hints = n_hints
         self.features = features
         self.preimage = preimage
@@ -140,7 +149,7 @@ class PSIMHints(PSIM, HintFilter):
         candidates = self._candidates()
         super().fit(train, validation)
         if self.preimage == "belief":
-            candidates = {"belief": FromBelief(self._phi)}
+            candidates = {"belief": FromBelief(self._phi, self.hint_weight)}
         seen = self._rows(train)
         unseen = None if validation is None else self._rows(validation)
         self._reading = HintReading().fit(*seen, candidates, unseen)
@@ -198,6 +207,8 @@ class PSIMHints(PSIM, HintFilter):
     def _begin_predictive(self, train: Sequences, validation: Sequences | None) -> TrainingData:
         check_whole("n_future", self.n_future, 0)
         check_whole("n_hints", self.n_hints, 1)
+        if not (np.isfinite(self.hint_weight) and self.hint_weight > 0):
+            raise ValueError(f"expected hint_weight finite and above 0, got {self.hint_weight!r}")
         needed = max(self.n_future, self.n_hints - 1) + 1
         train = self._long_enough(train, f"max(n_future, n_hints - 1) + 1 = {needed}")
         self._begin(train, validation)
@@ -231,25 +242,33 @@ class PSIMHints(PSIM, HintFilter):
         n_targets, k, n = self._n_targets(sequences), self.n_future, len(sequences)
         z = self._scale.apply(sequences.observations)
         h = self._hint_scale.apply(self._hints_of(sequences, "trajectories"))
-        n_rows = z.shape[1]
-        count = max(n_rows - max(k, self.n_hints - 1), 0)
-        hints = cut_futures(h, self.n_hints)[:, :count].reshape(n, count, -1)
+        n_rows, longest = z.shape[1], max(k, self.n_hints - 1)
+        row = np.arange(n_rows + longest)
+        if self.pad_end:
+            row = np.minimum(row, sequences.lengths[:, None])  # (n, n_rows + longest)
+        else:
+            row = np.broadcast_to(
+                np.minimum(row, n_rows - 1), (n, len(row))
+            )  # what is not complete is cleared below
+        episode = np.arange(n)[:, None]
+        hints = cut_futures(h[episode, row], self.n_hints)[:, :n_rows].reshape(n, n_rows, -1)
         flat = np.zeros((n, n_rows + 1, hints.shape[2] + k * self.n_obs_))
-        flat[:, 1 : count + 1, : hints.shape[2]] = hints
-        flat[:, :1, : hints.shape[2]] = hints[:, :1]
+        flat[:, 1:, : hints.shape[2]] = self.hint_weight * hints
+        flat[:, 0, : hints.shape[2]] = self.hint_weight * hints[:, 0]
         if k:
-            futures = cut_futures(z, k)[:, : count + 1]
-            flat[:, : futures.shape[1], hints.shape[2] :] = futures.reshape(n, futures.shape[1], -1)
+            futures = cut_futures(z[episode, row], k)[:, : n_rows + 1]
+            flat[:, :, hints.shape[2] :] = futures.reshape(n, n_rows + 1, -1)
         flat[np.arange(n_rows + 1) >= n_targets[:, None]] = 0.0
         return flat, n_targets
 
     def _n_targets(self, sequences: Sequences) -> Counts:
-        needed = max(self.n_future, self.n_hints - 1)
+        needed = 0 if self.pad_end else max(self.n_future, self.n_hints - 1)
         count: Counts = sequences.lengths + 1 - needed
         if not (count > 0).any():
             raise ValueError(
                 f"expected a trajectory of at least max(n_future, n_hints - 1) + 1 = {needed + 1} observations, got "
-                f"{len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower n_future or n_hints"
+                f"{len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower n_future or n_hints, or "
+                "pass pad_end=True"
             )
         return np.where(count > 0, count + 1, 0)
 
@@ -266,7 +285,7 @@ class PSIMHints(PSIM, HintFilter):
     def _hint_error(self, beliefs: Array, sequences: Sequences) -> float:
         """Of the hint as the belief itself holds it: mean over trajectories of the mean over t, standardised."""
         n, n_rows, size = beliefs[:, 1:].shape
-        read = self._phi.read_hint(beliefs[:, 1:].reshape(-1, size)).reshape(n, n_rows, -1)
+        read = self._phi.read_hint(beliefs[:, 1:].reshape(-1, size)).reshape(n, n_rows, -1) / self.hint_weight
         truth = self._hint_scale.apply(self._hints_of(sequences, "trajectories"))
         return float(nan_mean(np.square(read - truth).sum(axis=2), 1).mean())
 
@@ -307,6 +326,8 @@ class InferenceMachineFilter(PSIMHints):
 
     n_future = 0
     n_hints = 1
+    pad_end = False
+    hint_weight = 1.0
 
     def __init__(
         self,

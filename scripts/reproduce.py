@@ -30,6 +30,9 @@ REPRODUCTIONS = {
     "psim-synthetic": "beliefgym.scripts.reproductions.psim_synthetic:run",
     "psim-recorded": "beliefgym.scripts.reproductions.psim_recorded:run",
     "psim-amount": "beliefgym.scripts.reproductions.psim_amount:run",
+    "hints-pendulum": "beliefgym.scripts.reproductions.hints_tables:pendulum",
+    "hints-attitude": "beliefgym.scripts.reproductions.hints_tables:attitude",
+    "hints-mass": "beliefgym.scripts.reproductions.hints_tables:mass",
 }
 
 
