@@ -36,6 +36,12 @@ if TYPE_CHECKING:
     from beliefgym.learning.filter_errors import FilterErrors
     from beliefgym.learning.filter_files import load_filter, save_filter
     from beliefgym.learning.filters import Filter
+    from beliefgym.learning.hint_autoregressive import AutoregressiveHints
+    from beliefgym.learning.hint_errors import HintErrors
+    from beliefgym.learning.hint_estimator import HintEstimator
+    from beliefgym.learning.hint_filter import HintEstimate, HintFilter
+    from beliefgym.learning.hint_kalman import KalmanHints
+    from beliefgym.learning.hint_recurrent import GRUHints, LSTMHints
     from beliefgym.learning.instrumental_regression import InstrumentalVariableRegression
     from beliefgym.learning.kalman_filter import KalmanFilter
     from beliefgym.learning.linear_gaussian import LinearGaussianSystem
@@ -45,6 +51,7 @@ if TYPE_CHECKING:
     from beliefgym.learning.psim import PSIM
     from beliefgym.learning.psim_backprop import BackpropPSIM
     from beliefgym.learning.psim_forward import ForwardPSIM
+    from beliefgym.learning.psim_hints import InferenceMachineFilter, PSIMHints
     from beliefgym.learning.psim_stream import LearningStream
     from beliefgym.learning.random_forest import RandomForest
     from beliefgym.learning.random_fourier import RandomFourierRidge
@@ -57,6 +64,7 @@ __all__ = [
     "N4SID",
     "PSIM",
     "AutoregressiveFilter",
+    "AutoregressiveHints",
     "BackpropPSIM",
     "BackpropThroughTime",
     "DataAsDemonstrator",
@@ -67,13 +75,22 @@ __all__ = [
     "FilterErrors",
     "ForwardPSIM",
     "GRUFilter",
+    "GRUHints",
+    "HintErrors",
+    "HintEstimate",
+    "HintEstimator",
+    "HintFilter",
+    "InferenceMachineFilter",
     "InstrumentalVariableRegression",
     "KalmanFilter",
+    "KalmanHints",
     "LSTMFilter",
+    "LSTMHints",
     "LaggedError",
     "LearningStream",
     "LinearGaussianSystem",
     "MultiStepErrors",
+    "PSIMHints",
     "PolynomialRidge",
     "RandomForest",
     "RandomFourierRidge",
@@ -106,6 +123,7 @@ __all__ = [
 
 _MODULES = {
     "AutoregressiveFilter": "autoregressive_filter",
+    "AutoregressiveHints": "hint_autoregressive",
     "BackpropPSIM": "psim_backprop",
     "BackpropThroughTime": "backprop_through_time",
     "DataAsDemonstrator": "data_as_demonstrator",
@@ -116,15 +134,24 @@ _MODULES = {
     "FilterErrors": "filter_errors",
     "ForwardPSIM": "psim_forward",
     "GRUFilter": "recurrent_filter",
+    "GRUHints": "hint_recurrent",
+    "HintErrors": "hint_errors",
+    "HintEstimate": "hint_filter",
+    "HintEstimator": "hint_estimator",
+    "HintFilter": "hint_filter",
+    "InferenceMachineFilter": "psim_hints",
     "InstrumentalVariableRegression": "instrumental_regression",
     "KalmanFilter": "kalman_filter",
+    "KalmanHints": "hint_kalman",
     "LSTMFilter": "recurrent_filter",
+    "LSTMHints": "hint_recurrent",
     "LaggedError": "backprop_through_time",
     "LearningStream": "psim_stream",
     "LinearGaussianSystem": "linear_gaussian",
     "MultiStepErrors": "multi_step_error",
     "N4SID": "subspace_identification",
     "PSIM": "psim",
+    "PSIMHints": "psim_hints",
     "PolynomialRidge": "polynomial",
     "RandomForest": "random_forest",
     "RandomFourierRidge": "random_fourier",

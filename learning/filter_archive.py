@@ -33,6 +33,8 @@ MODULES = {  # the classes that a file may name, and where they are
     "KalmanFilter": "kalman_filter",
     "N4SID": "subspace_identification",
     "InstrumentalVariableRegression": "instrumental_regression",
+    "PSIMHints": "psim_hints",
+    "InferenceMachineFilter": "psim_hints",
     "Ridge": "linear_in_features",
     "RandomFourierRidge": "random_fourier",
 }
@@ -223,10 +225,11 @@ def from_plain(told: Any) -> Any:
     if told["class"] not in MODULES:
         raise ValueError(f"expected one of {', '.join(MODULES)} in a saved filter, got {told['class']!r}")
     cls = getattr(import_module(f"beliefgym.learning.{MODULES[told['class']]}"), told["class"])
-    parameters = told["parameters"].items()
-    return cls(
-        **{name: from_plain(value) if isinstance(value, dict) else value for name, value in parameters}
-    )
+    return cls(**{name: _from_plain_value(value) for name, value in told["parameters"].items()})
+
+
+def _from_plain_value(value: Any) -> Any:
+    return from_plain(value) if isinstance(value, dict) else value
 
 
 def _plain_value(name: str, value: Any) -> Any:

@@ -6,6 +6,8 @@ parameters. Nothing of it is run when it is read, and every array is checked for
 filter filters, predicts and forecasts as the saved one, to the last bit on the same machine. It holds no sums: it does
 not learn on, and `PSIM.partial_fit` says so.
 
+A filter of hints keeps the pre-image that was chosen: as its parameter too, where there were several to choose from.
+
 Parameters come back as they were, but tuples and ranges as lists, and a random_state that is a generator as None. A
 `BackpropPSIM` comes back without `psim_`.
 """
@@ -26,6 +28,7 @@ from safetensors.numpy import save
 from beliefgym.learning.filter_archive import Archive, Shape, from_plain, plain
 from beliefgym.learning.filters import Filter
 from beliefgym.learning.future_features import FirstMoments, SecondMoments
+from beliefgym.learning.hint_files import hints_layout
 from beliefgym.learning.linear_gaussian import LinearGaussianSystem, StationaryGain, WhitenedObservation
 from beliefgym.learning.whole_files import written_whole
 
@@ -44,9 +47,9 @@ def save_filter(filter: Filter, path: str | os.PathLike[str]) -> Path:
     """Write a fitted filter to one file; an existing file is replaced in one move.
 
     Args:
-        filter: a `PSIM`, `ForwardPSIM` or `BackpropPSIM` with features "first" or "second", a `KalmanFilter`, `N4SID`,
-            `InstrumentalVariableRegression` or `AutoregressiveFilter`; its regressor, if any, `Ridge` or
-            `RandomFourierRidge`.
+        filter: a `PSIM`, `ForwardPSIM`, `BackpropPSIM`, `PSIMHints` or `InferenceMachineFilter` with features "first"
+            or "second", a `KalmanFilter`, `N4SID`, `InstrumentalVariableRegression` or `AutoregressiveFilter`; its
+            regressors, if any, `Ridge` or `RandomFourierRidge`.
         path: the file, used as it is (no ending is added; ".safetensors" is usual).
 
     Returns:
@@ -64,7 +67,7 @@ def save_filter(filter: Filter, path: str | os.PathLike[str]) -> Path:
     filter._check_fitted()
     is_known = kind == "KalmanFilter" and getattr(filter, "method", None) == "known"
     header: dict[str, Any] = {"version": FORMAT_VERSION, "column_major": []}
-    header |= plain(filter, leaving=("system",) if is_known else ())
+    header |= plain(filter, leaving=("system",) if is_known else ("preimage",))
     archive = Archive(f"this {kind}", header, {}, is_loading=False)
     archive.whole(filter, "n_obs_")
     LAYOUTS[kind](filter, archive)
@@ -267,4 +270,6 @@ LAYOUTS: dict[str, Callable[[Any, Archive], None]] = {
     "KalmanFilter": _kalman,
     "N4SID": _linear,
     "InstrumentalVariableRegression": _instrumental,
+    "PSIMHints": hints_layout,
+    "InferenceMachineFilter": hints_layout,
 }

@@ -141,7 +141,12 @@ class ResidualVariance:
         features = np.concatenate([rows, rows * rows], axis=1)
         features -= self.centre
         features /= self.spread
-        return np.clip(features, -CLIPPED, CLIPPED, out=features)
+        return self.clipped(features)
+
+    @staticmethod
+    def clipped(features: Array) -> Array:
+        """Standardised features within the bounds."""
+        return np.minimum(np.maximum(features, -CLIPPED), CLIPPED)
 
     def _log_variance(self, standardised: Array) -> Array:
         return np.clip(standardised @ self.weights + self.offset, self.low, self.high)
