@@ -19,6 +19,7 @@ BENCHMARKS = {
     "dad": "beliefgym.scripts.benchmarks.dad:run",
     "control": "beliefgym.scripts.benchmarks.control:run",
     "filter": "beliefgym.scripts.benchmarks.filter:run",
+    "hints": "beliefgym.scripts.benchmarks.hints:run",
 }
 
 
@@ -32,7 +33,7 @@ class Benchmark:
     """
 
     name: tyro.conf.Positional[str]
-    """Which: env, dad, control, filter."""
+    """Which: env, dad, control, filter, hints."""
     results: Path = Path("results")
     """Folder; NAME.json and NAME.md are written to its benchmark/."""
 
