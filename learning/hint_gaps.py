@@ -32,13 +32,12 @@ def gap_growth(filter: HintFilter, sequences: Sequences) -> Array:
     """
     hints = filter._hints_of(sequences, "trajectories")
     beliefs = filter.beliefs(sequences)
-    n_rows = hints.shape[1]
-    longest = min(LONGEST, n_rows - 1)
-    episode, start = np.nonzero(
-        np.arange(n_rows - max(longest, 1)) <= sequences.lengths[:, None] - max(longest, 1)
-    )
-    if len(start) < LEAST_ROWS or longest < 1:
+    after = np.arange(1, min(LONGEST, hints.shape[1] - 1) + 1)  # estimates that j missed observations lead to
+    n_starts = np.maximum(sequences.lengths[:, None] - after + 1, 0).sum(axis=0)
+    longest = int(np.count_nonzero(n_starts >= LEAST_ROWS))
+    if not longest:
         return np.ones((1, hints.shape[2]))
+    episode, start = np.nonzero(np.arange(hints.shape[1]) <= sequences.lengths[:, None] - longest)
     if len(start) > MOST_ROWS:
         chosen = np.sort(np.random.default_rng(0).permutation(len(start))[:MOST_ROWS])
         episode, start = episode[chosen], start[chosen]

@@ -147,6 +147,7 @@ class PSIMHints(PSIM, HintFilter):
             TypeError: not `Sequences`, a pre-image that is no regressor.
         """
         candidates = self._candidates()
+        self.__dict__.pop("model_", None)
         super().fit(train, validation)
         if self.preimage == "belief":
             candidates = {"belief": FromBelief(self._phi, self.hint_weight)}
