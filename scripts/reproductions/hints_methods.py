@@ -39,8 +39,10 @@ BANDWIDTHS = (0.5, 1.0, 2.0)  # times the square root of the number of inputs
 WAVES, SCREENED_WAVES = 300, 100  # random frequencies; of the settings that are only screened
 N_ITERATIONS, SCREENING = 25, 12  # of DAgger; of these
 N_FINAL = 2  # settings that are fitted in full
+FOREST: dict[str, Any] = {"n_estimators": 30, "max_samples": 4000, "min_samples_leaf": 5, "max_features": 0.4}
+PREIMAGE_WAVES = 200
 N_PAST = 5  # k_p of the autoregressive filter, as in the thesis
-RATES = (3e-3, 1e-2)  # of the recurrent network
+RATES, N_EPOCHS, PATIENCE = (3e-3, 1e-2), 80, 20  # of the recurrent network
 WIDE = {"lift", "payload"}  # tasks of many components: fewer iterations, fewer settings
 Setting = dict[str, Any]
 Make = Callable[[Setting, bool], HintFilter]  # a setting, and whether it is to be fitted in full
@@ -80,7 +82,7 @@ def results(group: str, name: str, parts: Parts, seed: int) -> dict[str, Any]:
             from beliefgym.learning.hint_recurrent import GRUHints
 
             def network(setting: Setting, whole: bool) -> HintFilter:
-                return GRUHints(random_state=seed, patience=20, n_epochs=80, **setting)
+                return GRUHints(random_state=seed, patience=PATIENCE, n_epochs=N_EPOCHS, **setting)
 
             return {"GRU": _chosen(network, [{"learning_rate": rate} for rate in RATES], parts)}
         if group == "whole":
@@ -202,17 +204,12 @@ def _regressor(setting: Setting, n_inputs: int, whole: bool, seed: int) -> Any:
 
 
 def _preimages(whole: bool, seed: int) -> Sequence[Any]:
+    n = PREIMAGE_WAVES if whole else PREIMAGE_WAVES // 2
     waves = [
-        RandomFourierRidge(
-            n_frequencies=200 if whole else 100, alpha=alpha, include_inputs=True, random_state=seed
-        )
+        RandomFourierRidge(n_frequencies=n, alpha=alpha, include_inputs=True, random_state=seed)
         for alpha in ((1e-5, 1e-3) if whole else (1e-4,))
     ]
-    forest = [
-        RandomForest(
-            n_estimators=30, max_samples=4000, min_samples_leaf=5, max_features=0.4, random_state=seed
-        )
-    ]
+    forest = [RandomForest(**FOREST, random_state=seed)]
     return [Ridge(alpha=1e-4), *waves, *(forest if whole else [])]
 
 
