@@ -95,15 +95,19 @@ class HintEstimator:
         x = np.asarray(observation, dtype=np.float64)
         if x.shape != self._shape:
             raise ValueError(f"observation: expected shape {self._shape}, got {x.shape}")
-        is_whole = np.isfinite(x).all()
+        z = (x - self._offset) * self._per_scale
+        is_whole = np.isfinite(z).all()
         if not is_whole:
             check_observed(x[None], self.missing)
-        z = (x - self._offset) * self._per_scale
+            if np.isinf(z).any():
+                raise ValueError(
+                    f"observation: expected numbers like the training data's, got {x}: too large"
+                )
         if self._step is None or not is_whole:
             belief = self._slowly(z, action)
         else:
             belief = self._step(self._belief, z)
-            if (np.abs(belief) > self._bound).any():
+            if not (np.abs(belief) <= self._bound).all():  # NaN too
                 belief = self._slowly(z, action)
         mean, std = self._read(belief)
         if not is_whole:
