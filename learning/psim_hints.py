@@ -24,7 +24,6 @@ filter learning", IJCAI 2016.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -52,7 +51,7 @@ from beliefgym.learning.random_fourier import RandomFourierRidge
 from beliefgym.learning.sequences import Sequences
 
 Array = NDArray[np.float64]
-Preimage = Literal["belief"] | BaseEstimator | Sequence[BaseEstimator] | None
+Preimage = Any  # a regressor, a sequence of them, "belief" or None: scikit-learn has no type for regressors
 LEAST_PAST = 5  # observations that F_0 sees twice as many of where k is smaller
 
 
@@ -92,6 +91,7 @@ class PSIMHints(PSIM, HintFilter):
     """
 
     target = "next"
+    features: Any  # HintFeatures; the base's are functions of futures alone
     _phi: HintMoments
 
     def __init__(
@@ -149,7 +149,8 @@ class PSIMHints(PSIM, HintFilter):
         candidates = self._candidates()
         self.__dict__.pop("model_", None)
         super().fit(train, validation)
-        if self.preimage == "belief":
+        self._told_divergence = True  # here it is no news: `n_bounded` counts it
+        if isinstance(self.preimage, str):
             candidates = {"belief": FromBelief(self._phi, self.hint_weight)}
         seen = self._rows(train)
         unseen = None if validation is None else self._rows(validation)
@@ -160,6 +161,7 @@ class PSIMHints(PSIM, HintFilter):
             regressor = Ridge() if self.regressor is None else self.regressor
             self._observer = fitted(regressor, self.beliefs(train)[:, :-1][mask], z[mask])
         self.gap_growth_ = gap_growth(self, train if validation is None else validation)
+        self._told_divergence = False
         return self
 
     def partial_fit(self, train: Sequences) -> Self:

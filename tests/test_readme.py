@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from beliefgym.learning import DataAsDemonstrator, load_filter
+from beliefgym.learning import DataAsDemonstrator, Sequences, load_filter
 from beliefgym.scripts.reproductions.dad_data import pendulum
 
 README = Path(__file__).parents[1] / "README.md"
@@ -140,3 +140,35 @@ def test_the_readmes_filter_forecasts(tmp_path):
     assert names["next_twenty"].shape == (1, 20, 3)
     last = test.observations[0, -1]
     assert np.abs(names["next_twenty"][0, 0] - last).max() < 0.5
+
+
+@in_checkout
+def test_the_readmes_estimator_follows_a_stream():
+    (example,) = (block for block in blocks_of(README) if "HintEstimator(" in block)
+    runs = pendulum(0, n=60, n_steps=60)
+    hints = np.arctan2(runs.observations[:, :, 1:2], runs.observations[:, :, 0:1])
+    seen = Sequences.from_observations(runs.observations[:, :, :2], hints=hints)
+    train, validation, test = seen.split((0.8, 0.1, 0.1), seed=0)
+    stream = np.array(test.observations[0])
+    stream[7] = np.nan
+    names: dict = {"train": train, "validation": validation, "stream": stream}
+    exec(example, names)
+    assert names["estimate"].shape == names["std"].shape == (1,)
+    assert names["estimator"].n_seen == 61
+
+
+@in_checkout
+def test_the_guide_to_hints_runs():
+    """Both blocks: a payload's mass estimated beside an environment, and a filter that knows its system."""
+    first, second = blocks_of(README.parent / "docs" / "filters-with-hints.md")
+    names: dict = {}
+    exec(first, names)
+    errors, truth = names["errors"], names["field"].unwrapped.state[18]
+    assert (
+        errors.by_time[-20:].mean() < 0.6 * errors.by_time[:20].mean() < 0.09
+    )  # kg: it learns of the mass on the way
+    assert abs(names["mass"][0] - truth) < 4 * names["std"][0] < 0.3
+    exec(second, names)
+    assert (
+        abs(np.sin(names["angle_and_speed"][0, 0]) - 0.2) < 0.02
+    )  # what was seen of it, nearly without noise

@@ -127,7 +127,8 @@ def _whole(name: str, data: Path | None) -> tuple[Sequences, NDArray[Any]]:
     names = [str(component) for component in arrays["names"]]
     if name == "imu":
         gravity = arrays["rotations"][:, :, 2].astype(float)  # R^T e3: the third row of R
-        hints, hint_names, groups = gravity, ("up_x", "up_y", "up_z"), arrays["recording"]
+        hint_names: tuple[str, ...] = ("up_x", "up_y", "up_z")
+        hints, groups = gravity, arrays["recording"]
     else:
         mass = arrays["mass_g"].astype(float)
         hints = np.repeat(mass[:, None, None], observations.shape[1], axis=1)

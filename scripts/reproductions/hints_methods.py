@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,11 +32,37 @@ from beliefgym.scripts.reproductions.hints_data import TASKS, Parts
 from beliefgym.scripts.reproductions.psim_methods import quiet
 
 VERSION = 1  # of the grids; cells made with another one run again
-VERSIONS: dict[tuple[str, str], int] = {}  # where those of a task and group are others
-ALPHAS = (1e-8, 1e-5, 1e-2)  # a sample, standardised
-WIDE_ALPHAS = (1e-6, 1e-5)  # of random features, on wide tasks
-HINT_WEIGHTS = (1.0, 3.0)  # on wide tasks
-BANDWIDTHS = (0.5, 1.0, 2.0)  # times the square root of the number of inputs
+VERSIONS = {
+    ("lift", group): 2 for group in ("ar", "imf", "psim-5", "psim-40")
+}  # where a task's and group's are others
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Settings of a task's learned filters: ridges a sample, in standardised units, and of random features theirs.
+
+    Attributes:
+        alphas: of linear ones. bandwidths: of random features, times the square root of the number of inputs.
+        wave_alphas: their ridges. hint_weights: of PSIM+Hints with random features.
+    """
+
+    alphas: tuple[float, ...]
+    bandwidths: tuple[float, ...]
+    wave_alphas: tuple[float, ...]
+    hint_weights: tuple[float, ...] = (1.0,)
+
+
+SWINGS = Grid((1e-8, 1e-5, 1e-2), (0.5, 1.0, 2.0), (1e-8, 1e-5, 1e-2))
+ATTITUDES = Grid((1e-6, 1e-4, 1e-2, 1e-1), (1.0, 2.0, 4.0), (1e-6, 1e-4, 1e-2))
+GRIDS = {
+    "pendulum-full": SWINGS,
+    "pendulum-partial": SWINGS,
+    "pendulum-noisy": SWINGS,
+    "quadrotor": ATTITUDES,
+    "imu": ATTITUDES,
+    "lift": Grid((1e-5, 1e-3, 1e-1), (2.0, 4.0), (1e-5, 1e-4, 1e-3), (1.0, 3.0)),
+    "payload": Grid((1e-8, 1e-5, 1e-2, 1e-1), (1.0, 2.0), (1e-6, 1e-5), (1.0, 3.0)),
+}
 WAVES, SCREENED_WAVES = 300, 100  # random frequencies; of the settings that are only screened
 N_ITERATIONS, SCREENING = 25, 12  # of DAgger; of these
 N_FINAL = 2  # settings that are fitted in full
@@ -44,6 +71,7 @@ PREIMAGE_WAVES = 200
 N_PAST = 5  # k_p of the autoregressive filter, as in the thesis
 RATES, N_EPOCHS, PATIENCE = (3e-3, 1e-2), 80, 20  # of the recurrent network
 WIDE = {"lift", "payload"}  # tasks of many components: fewer iterations, fewer settings
+N_MOTIONS, MOTION_BINS = 4, 10  # of the recorded lifts: pick, hold, shake, lower
 Setting = dict[str, Any]
 Make = Callable[[Setting, bool], HintFilter]  # a setting, and whether it is to be fitted in full
 
@@ -57,7 +85,7 @@ def groups(name: str) -> tuple[str, ...]:
         *(f"psim-{k}" for k in TASKS[name].horizons),
         "gru",
         *(("physics",) if has_physics(name) else ()),
-        *(("whole",) if name == "payload" else ()),
+        *(("whole", "told-phase") if name == "payload" else ()),
     )
 
 
@@ -87,6 +115,10 @@ def results(group: str, name: str, parts: Parts, seed: int) -> dict[str, Any]:
             return {"GRU": _chosen(network, [{"learning_rate": rate} for rate in RATES], parts)}
         if group == "whole":
             return {"ridge, whole trajectory": _whole_trajectory(parts)}
+        if group == "told-phase":
+            told = (_with_phase(train), _with_phase(validation), _with_phase(test))
+            found = _chosen(_psim(name, 0, told[0], seed), _settings(name), told)
+            return {"IMF, told the phase": found}
         if group == "ar":
 
             def past(setting: Setting, whole: bool) -> HintFilter:
@@ -97,7 +129,7 @@ def results(group: str, name: str, parts: Parts, seed: int) -> dict[str, Any]:
         if group == "imf":
             return {"IMF": _chosen(_psim(name, 0, train, seed), _settings(name), parts)}
         k = int(group.removeprefix("psim-"))
-        settings = _settings(name, HINT_WEIGHTS if name in WIDE else (1.0,))
+        settings = _settings(name, GRIDS[name].hint_weights)
         return {f"PSIM+Hints (k_f = {k})": _chosen(_psim(name, k, train, seed), settings, parts)}
 
 
@@ -143,6 +175,17 @@ def _whole_trajectory(parts: Parts) -> dict[str, Any]:
     }
 
 
+def _with_phase(part: Sequences) -> Sequences:
+    """The lifts with what the robot itself knows: which of its four motions it is in, and how far."""
+    n, n_rows, _ = part.observations.shape
+    time = np.arange(n_rows)
+    motion = np.eye(N_MOTIONS)[time // MOTION_BINS]
+    told = np.column_stack([motion, (time % MOTION_BINS) / MOTION_BINS])
+    everyone = np.broadcast_to(told, (n, *told.shape))
+    observations = np.concatenate([part.observations, everyone], axis=2)
+    return Sequences.from_observations(observations, hints=part.hints, lengths=part.lengths)
+
+
 def _at_the_end(part: Sequences) -> tuple[Any, Any]:
     assert part.hints is not None
     return part.observations.reshape(len(part), -1), part.hints[np.arange(len(part)), part.lengths]
@@ -175,20 +218,20 @@ def _psim(name: str, k: int, train: Sequences, seed: int) -> Make:
 
 
 def _settings(name: str, weights: Sequence[float] = (1.0,)) -> list[Setting]:
-    wide = name in WIDE
-    settings: list[Setting] = [
-        {"family": "linear", "alpha": alpha} for alpha in (*ALPHAS, *((1e-1,) if wide else ()))
-    ]
-    settings += [
-        {"family": "RFF", "bandwidth": bandwidth, "alpha": alpha}
-        for bandwidth in (BANDWIDTHS[1:] if wide else BANDWIDTHS)
-        for alpha in (WIDE_ALPHAS if wide else ALPHAS)
-    ]
+    grid = GRIDS[name]
     return [
-        one | ({} if weight == 1.0 else {"hint_weight": weight})
-        for one in settings
-        for weight in (weights if one["family"] == "RFF" else (1.0,))
+        *({"family": "linear", "alpha": alpha} for alpha in grid.alphas),
+        *(
+            {"family": "RFF", "bandwidth": bandwidth, "alpha": alpha} | _weighed(weight)
+            for bandwidth in grid.bandwidths
+            for alpha in grid.wave_alphas
+            for weight in weights
+        ),
     ]
+
+
+def _weighed(weight: float) -> Setting:
+    return {} if weight == 1.0 else {"hint_weight": weight}
 
 
 def _regressor(setting: Setting, n_inputs: int, whole: bool, seed: int) -> Any:

@@ -41,7 +41,7 @@ ROUGHENINGS: tuple[dict[str, Any], ...] = (
     {"roughening": 0.01},
     {"roughening": 0.03},
 )
-TYPICAL = {"kP": 1.0, "kI": 0.3}  # gains
+TYPICAL: dict[str, Any] = {"kP": 1.0, "kI": 0.3}  # gains
 
 
 def physics(name: str, parts: Parts, seed: int) -> Found:

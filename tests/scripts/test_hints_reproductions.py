@@ -25,8 +25,7 @@ def small(monkeypatch):
             "N_LIFTS": 10,
         },
         hints_methods: {
-            "ALPHAS": (1e-6, 1e-2),
-            "BANDWIDTHS": (1.0, 2.0),
+            "GRIDS": dict.fromkeys(hints_data.TASKS, hints_methods.Grid((1e-6, 1e-2), (1.0, 2.0), (1e-4,))),
             "WAVES": 12,
             "SCREENED_WAVES": 6,
             "SCREENING": 1,
