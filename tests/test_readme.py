@@ -164,9 +164,8 @@ def test_the_guide_to_hints_runs():
     names: dict = {}
     exec(first, names)
     errors, truth = names["errors"], names["field"].unwrapped.state[18]
-    assert (
-        errors.by_time[-20:].mean() < 0.6 * errors.by_time[:20].mean() < 0.09
-    )  # kg: it learns of the mass on the way
+    # the arm lifts at half of the episode: before, the mass is not to be seen
+    assert errors.by_time[-20:].mean() < 0.8 * errors.by_time[:20].mean() < 0.09
     assert abs(names["mass"][0] - truth) < 4 * names["std"][0] < 0.3
     exec(second, names)
     assert (
