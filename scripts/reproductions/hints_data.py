@@ -68,9 +68,9 @@ TASKS = {
     "pendulum-partial": Task("pendulum, angle alone", "rad", "3.6", (5, 10, 20), "partial"),
     "pendulum-noisy": Task("noisy pendulum, full state", "rad, rad/s", "3.6", (20,)),
     "quadrotor": Task("quadrotor attitude, simulated", "rad", "3.7", (5, 20), "quadrotor"),
-    "imu": Task("upward direction, recorded IMU", "rad", "3.7", (5, 20)),
+    "imu": Task("upward direction, recorded IMU", "rad", "3.7", (5,)),
     "lift": Task("payload mass, simulated arm", "g", "3.8", (5, 40), "mass"),
-    "payload": Task("payload mass, recorded lifts", "g", "3.8", (5, 20)),
+    "payload": Task("payload mass, recorded lifts", "g", "3.8", (5,)),
 }
 
 

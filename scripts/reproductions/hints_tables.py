@@ -91,18 +91,20 @@ CLAIMS: dict[str, tuple[tuple[str, str, bool], ...]] = {
     ),
     "imu": (
         *((psim(5), rival, True) for rival in (COMPLEMENTARY, IMF, AR, KF)),
-        (psim(20), psim(5), False),
+        (IMF, COMPLEMENTARY, False),
         (psim(5), "GRU", False),
     ),
     "lift": (
         *((psim(40), rival, True) for rival in (AR, KF)),
         (psim(40), psim(5), False),
+        (psim(40), IMF, False),
         (psim(40), "GRU", False),
     ),
     "payload": (
-        *((psim(20), rival, True) for rival in (AR, KF)),
-        (psim(20), psim(5), False),
-        (psim(20), "GRU", False),
+        *((ours, rival, True) for ours in (psim(5), IMF) for rival in (AR, KF)),
+        (psim(5), IMF, False),
+        (TOLD, IMF, False),
+        (IMF, "GRU", False),
     ),
 }
 COLUMNS = ("what", "error", "sigma", "at the end", "z^2", "fit, s", "thesis", "ratio", "meets")
