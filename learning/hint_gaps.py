@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefgym.learning.hint_filter import HintFilter
+from beliefgym.learning.hint_reading import LEAST_SQUARED
 from beliefgym.learning.sequences import Sequences
 
 Array = NDArray[np.float64]
@@ -44,12 +45,13 @@ def gap_growth(filter: HintFilter, sequences: Sequences) -> Array:
     belief = beliefs[episode, start]
     told, filter._told_divergence = filter._told_divergence, True
     growth = np.empty((longest, hints.shape[2]))
+    rounding = LEAST_SQUARED * np.square(filter._hint_scale.scale)  # the least variance that a belief's is
     for j in range(1, longest + 1):
         t = start + j - 1
         belief = filter._advance(belief, filter._observe(belief))
         truth = hints[episode, t]
         missed = np.square(filter._read_hint(belief)[0] - truth).mean(axis=0)
         seen = np.square(filter._read_hint(beliefs[episode, t + 1])[0] - truth).mean(axis=0)
-        growth[j - 1] = missed / np.maximum(seen, np.finfo(float).tiny)
+        growth[j - 1] = missed / np.maximum(seen, rounding)
     filter._told_divergence = told
     return np.maximum.accumulate(np.maximum(growth, 1.0), axis=0)

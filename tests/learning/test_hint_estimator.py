@@ -24,6 +24,7 @@ from beliefgym.learning.psim import PSIM
 from beliefgym.learning.psim_hints import InferenceMachineFilter, PSIMHints
 from beliefgym.learning.random_forest import RandomForest
 from beliefgym.learning.random_fourier import RandomFourierRidge
+from beliefgym.learning.row_predictor import row_predictor
 
 A = np.array([[0.88, 0.29, 0.1], [-0.29, 0.88, 0.0], [0.0, 0.0, 0.7]])
 C = np.array([[1.0, 0.0, 0.5], [0.2, -1.0, 0.0]])
@@ -275,6 +276,23 @@ def test_uncertainty_grows_in_a_gap_and_is_back_after_as_many_observations(name)
         )  # the gap is forgotten
 
 
+def test_a_hint_that_is_read_without_any_error_is_told_with_a_finite_one_in_a_gap():
+    """Zero or one for whole trajectories; the forest is right to the last bit, until nothing is seen."""
+    hints = np.repeat(np.random.default_rng(0).integers(0, 2, (60, 1, 1)).astype(float), 31, axis=1)
+    data = Sequences.from_observations(10.0 * hints, hints=hints)
+    forest = RandomForest(n_estimators=5, random_state=0)
+    filter = AutoregressiveHints(forest, n_past=1, standardise=False).fit(data)
+    estimator = HintEstimator(filter, missing="predict")
+    estimate = estimator.update([10.0])
+    assert estimate.mean[0] == 1.0
+    assert estimate.std[0] < 1e-12
+    for _ in range(5):
+        assert estimator.update([np.nan]).std[0] < 1.0
+    assert np.isfinite(filter.gap_growth_).all()
+    estimator.reset()
+    assert 0.1 < estimator.update([np.nan]).std[0] < 1.0  # from the start, it is one or the other
+
+
 def test_after_a_gap_longer_than_any_measured_the_longest_counts():
     filter = fitted("imf")
     longest = len(filter.gap_growth_)
@@ -305,8 +323,13 @@ def test_beliefs_stay_finite_on_anything_and_recover(name):
     x[wild] += 1e6 * scale * rng.choice([-1.0, 1.0], (wild.sum(), 2))
     x[rng.random(x.shape) < 0.3] = np.nan
     x[100:160] = np.nan
+    belief, bound = filter.initial_belief(), np.abs(filter.beliefs(TEST)).max()
     for row in x:
         mean, std = estimator.update(row)
+        belief = filter.update(belief, row[None], missing="predict")
+        if np.abs(belief).max() <= 10.0 * bound:  # 1e6 is 1e-10 of it by rounding alone
+            np.testing.assert_allclose(estimator.belief, belief[0], rtol=1e-6, atol=1e-6)
+        belief = estimator.belief[None]
         assert np.isfinite(estimator.belief).all()
         assert np.isfinite(mean).all()
         assert np.isfinite(std).all()
@@ -400,16 +423,50 @@ def test_two_estimators_of_one_filter_do_not_share_anything(name):
 
 
 def test_estimates_are_arrays_of_their_own():
-    for name in FILTERS:
-        estimator = HintEstimator(fitted(name))
+    constant = clone(FILTERS["imf"]).fit(with_units(sampled(30)), with_units(sampled(1, seed=1)))
+    assert constant._reading.variance.penalty == np.inf
+    for filter in (constant, *(fitted(name) for name in FILTERS)):
+        estimator = HintEstimator(filter)
         first = estimator.update(TEST.observations[0, 0])
         kept = [part.copy() for part in first]
         estimator.update(TEST.observations[0, 1])
         for part, copy in zip(first, kept, strict=True):
             np.testing.assert_array_equal(part, copy)
-        prior = HintEstimator(fitted(name))
-        prior.estimate.mean[:] = 0.0
-        assert (fitted(name).prior_mean_ != 0.0).any()
+            part[:] = -1.0
+        estimator.reset()
+        for part, copy in zip(estimator.update(TEST.observations[0, 0]), kept, strict=True):
+            np.testing.assert_array_equal(part, copy)
+        HintEstimator(filter).estimate.mean[:] = 0.0
+        assert (filter.prior_mean_ != 0.0).any()
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Ridge(),
+        Ridge(fit_intercept=False),
+        waves(),
+        waves(include_inputs=True),
+        waves(fit_intercept=False, bandwidth=0.5),
+        PolynomialRidge(),
+        RandomForest(n_estimators=3, random_state=0),
+    ],
+    ids=repr,
+)
+@pytest.mark.parametrize("d", [1, 2])
+def test_a_row_is_predicted_as_a_batch_is(model, d):
+    rng = np.random.default_rng(0)
+    X, Y = rng.normal(size=(80, 4)), rng.normal(size=(80, d))
+    model = clone(model).fit(X, Y)
+    predict = row_predictor(model, d)
+    expected = model.predict(X).reshape(80, d)
+    found = [predict(row) for row in X]
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)  # each an array of its own
+    found[0][:] = 7.0
+    np.testing.assert_allclose(predict(X[0]), expected[0], rtol=1e-10, atol=1e-12)
+    if isinstance(model, Ridge | RandomFourierRidge):
+        model.fit(X, -Y)
+        np.testing.assert_allclose(predict(X[0]), expected[0], rtol=1e-10, atol=1e-12)
 
 
 def test_what_is_not_a_fitted_hint_filter_is_told():
