@@ -17,20 +17,18 @@ proposal's Sec. 3.4.3 has no recurrent network among its baselines; this one is 
 
 from __future__ import annotations
 
-import warnings
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beliefgym.learning.aggregation import predict_unchecked
-from beliefgym.learning.dynamics import DivergenceWarning, Standardise
+from beliefgym.learning.dynamics import Standardise
 from beliefgym.learning.filters import Filter
 from beliefgym.learning.hint_filter import HintFilter
 from beliefgym.learning.hint_gaps import gap_growth
 from beliefgym.learning.hint_reading import ResidualVariance, fitted
 from beliefgym.learning.linear_in_features import Ridge
-from beliefgym.learning.recurrent_cells import RecurrentModel
 from beliefgym.learning.recurrent_filter import Arrangement, RecurrentFilter
 from beliefgym.learning.sequences import Sequences
 from beliefgym.learning.standardisation import Standardisation
@@ -137,22 +135,7 @@ class RecurrentHints(RecurrentFilter, HintFilter):
         if validation is not None:
             parts = self._examples(validation)
             validated = training.Examples.of(*parts, validation.lengths + 1, self.device)
-        sizes = (examples.inputs.shape[2], self.hidden_size, self.n_layers, 1, self.n_hint_)
-        network = training.RecurrentNetwork(self._cell, *sizes, rng).to(self.device)
-        plan = training.Plan(**{name: getattr(self, name) for name in training.Plan.__dataclass_fields__})
-        loop = training.Training(network, examples, validated, np.ones(1), np.square(scale), plan, rng)
-        loop.run()
-        self.history_: dict[str, Array] = {name: np.array(values) for name, values in loop.history.items()}
-        self.best_epoch_ = loop.best_epoch
-        self.model_: RecurrentModel = network.exported(self._target.offset[None], scale)
-        if loop.diverged is not None:
-            warnings.warn(
-                f"training diverged in epoch {loop.diverged} of {self.n_epochs} (an error that is not finite) and was "
-                f"ended; the best weights, of epoch {self.best_epoch_}, are kept. A smaller learning_rate than "
-                f"{self.learning_rate:g} or max_gradient_norm than {self.max_gradient_norm} may help",
-                DivergenceWarning,
-                stacklevel=2,
-            )
+        self._train(examples, validated, self._target.offset[None], scale, np.ones(1), rng)
         self._learn_rest(train, train if validation is None else validation)
         return self
 

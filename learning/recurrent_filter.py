@@ -219,31 +219,45 @@ class RecurrentFilter(Filter):
         if validation is not None:
             parts = arrangement.examples(self._scale.apply(validation.observations), validation.lengths)
             validated = training.Examples.of(*parts, validation.lengths, self.device)
-        sizes = (examples.inputs.shape[2], self.hidden_size, self.n_layers, self.n_future, self.n_obs_)
-        network = training.RecurrentNetwork(self._cell, *sizes, rng).to(self.device)
-        loop = training.Training(
-            network,
-            examples,
-            validated,
-            self._weights_of_heads(),
-            np.square(arrangement.scale),
-            training.Plan(**{name: getattr(self, name) for name in training.Plan.__dataclass_fields__}),
-            rng,
-        )
-        loop.run()
+        scales = arrangement.offset, arrangement.scale
+        self._train(examples, validated, *scales, self._weights_of_heads(), rng)
         self._arrangement = arrangement
+        return self
+
+    def _train(
+        self,
+        examples: Any,
+        validated: Any,
+        offset: Array,
+        scale: Array,
+        head_weights: Array,
+        rng: np.random.Generator,
+    ) -> None:
+        """Train a network on `Examples` and take it over; sets `model_`, `history_` and `best_epoch_`.
+
+        Args:
+            examples, validated: of `recurrent_training`; validated may be None.
+            offset, scale: (k, d) of the targets. head_weights: (k,). rng: of all that is drawn.
+        """
+        from beliefgym.learning import recurrent_training as training
+
+        n_future, n_outputs = scale.shape
+        sizes = (examples.inputs.shape[2], self.hidden_size, self.n_layers, n_future, n_outputs)
+        network = training.RecurrentNetwork(self._cell, *sizes, rng).to(self.device)
+        plan = training.Plan(**{name: getattr(self, name) for name in training.Plan.__dataclass_fields__})
+        loop = training.Training(network, examples, validated, head_weights, np.square(scale), plan, rng)
+        loop.run()
         self.history_: dict[str, Array] = {name: np.array(values) for name, values in loop.history.items()}
         self.best_epoch_ = loop.best_epoch
-        self.model_: RecurrentModel = network.exported(arrangement.offset, arrangement.scale)
+        self.model_: RecurrentModel = network.exported(offset, scale)
         if loop.diverged is not None:
             warnings.warn(
                 f"training diverged in epoch {loop.diverged} of {self.n_epochs} (an error that is not finite) and was "
                 f"ended; the best weights, of epoch {self.best_epoch_}, are kept. A smaller learning_rate than "
                 f"{self.learning_rate:g} or max_gradient_norm than {self.max_gradient_norm} may help",
                 DivergenceWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
-        return self
 
     def _initial(self) -> Array:
         return np.concatenate([self.model_.initial.ravel(), self._arrangement.first[0], [0.0]])
