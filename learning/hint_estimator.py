@@ -8,9 +8,9 @@ It only filters: nothing is fitted, and no torch is needed. `PSIMHints` and `Inf
 `RandomFourierRidge` take some ten microseconds an update; every other `HintFilter` goes through its own batch of one.
 
 A missing observation (NaN) is refused, or bridged by the filter's own prediction, as the user chose. An update that
-raises leaves the belief as it was. A learned filter's standard deviation does not know of what was missed, so that it
-is multiplied here by sqrt(c_j) of `gap_growth` after j observations of which something was missing; each whole
-observation takes j down by one again.
+raises leaves the belief as it was. A learned filter's standard deviation does not know of what was missed, so that the
+variance c_j of `gap_growth` is added after j observations of which something was missing; each whole observation takes
+j down by one again.
 
 Reference: thesis proposal, Sec. 3.4.
 """
@@ -115,7 +115,7 @@ class HintEstimator:
         elif self._n_missed:
             self._n_missed = min(self._n_missed, self._longest) - 1
         if self._n_missed and self._growth is not None:
-            std = std * self._growth[min(self._n_missed, self._longest) - 1]
+            std = np.sqrt(std * std + self._growth[min(self._n_missed, self._longest) - 1])
         self._belief, self.n_seen, self.estimate = belief, self.n_seen + 1, HintEstimate(mean, std)
         return self.estimate
 
@@ -132,7 +132,7 @@ class HintEstimator:
         self._shape = (filter.n_obs_,)
         self._offset, self._per_scale = filter._scale.offset.copy(), 1.0 / filter._scale.scale
         growth = filter.gap_growth_
-        self._growth = None if growth is None else np.sqrt(growth)
+        self._growth = growth
         self._longest = 1 if growth is None else len(growth)
         self._bound: Array | None = filter._bound
         self._step: Step | None = _step_of(filter)

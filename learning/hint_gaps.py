@@ -3,9 +3,10 @@
 A learned filter goes on by its own prediction where an observation is missing, and its uncertainty, a function of the
 belief, does not know of that. Trajectories show it: with h_hat_{t|j} the estimate of h_t from x_0 .. x_{t-j} alone,
 
-    c_j = mean |h_hat_{t|j} - h_t|^2 / mean |h_hat_{t|0} - h_t|^2,     made to grow with j,
+    c_j = mean |h_hat_{t|j} - h_t|^2 - mean |h_hat_{t|0} - h_t|^2,     at least 0 and made to grow with j,
 
-for each component; the variance of an estimate after j missed observations is c_j times that of the belief.
+for each component; the variance of an estimate after j missed observations is c_j more than that of the belief. (A
+factor in its place is as good where the variance does not depend on the belief, and far off where it does.)
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefgym.learning.hint_filter import HintFilter
-from beliefgym.learning.hint_reading import LEAST_SQUARED
 from beliefgym.learning.sequences import Sequences
 
 Array = NDArray[np.float64]
@@ -29,7 +29,8 @@ def gap_growth(filter: HintFilter, sequences: Sequences) -> Array:
         filter: fitted. sequences: trajectories with hints, better not those it was fitted to.
 
     Returns:
-        (j, n_hint), j up to 20, at least 1; the last stands for longer gaps. Ones where there is too little to tell.
+        (j, n_hint) in squared units of the hint, j up to 20, at least 1; the last stands for longer gaps. Zeros where
+        there is too little to tell.
     """
     hints = filter._hints_of(sequences, "trajectories")
     beliefs = filter.beliefs(sequences)
@@ -37,7 +38,7 @@ def gap_growth(filter: HintFilter, sequences: Sequences) -> Array:
     n_starts = np.maximum(sequences.lengths[:, None] - after + 1, 0).sum(axis=0)
     longest = int(np.count_nonzero(n_starts >= LEAST_ROWS))
     if not longest:
-        return np.ones((1, hints.shape[2]))
+        return np.zeros((1, hints.shape[2]))
     episode, start = np.nonzero(np.arange(hints.shape[1]) <= sequences.lengths[:, None] - longest)
     if len(start) > MOST_ROWS:
         chosen = np.sort(np.random.default_rng(0).permutation(len(start))[:MOST_ROWS])
@@ -45,13 +46,12 @@ def gap_growth(filter: HintFilter, sequences: Sequences) -> Array:
     belief = beliefs[episode, start]
     told, filter._told_divergence = filter._told_divergence, True
     growth = np.empty((longest, hints.shape[2]))
-    rounding = LEAST_SQUARED * np.square(filter._hint_scale.scale)  # the least variance that a belief's is
     for j in range(1, longest + 1):
         t = start + j - 1
         belief = filter._advance(belief, filter._observe(belief))
         truth = hints[episode, t]
         missed = np.square(filter._read_hint(belief)[0] - truth).mean(axis=0)
         seen = np.square(filter._read_hint(beliefs[episode, t + 1])[0] - truth).mean(axis=0)
-        growth[j - 1] = missed / np.maximum(seen, rounding)
+        growth[j - 1] = missed - seen
     filter._told_divergence = told
-    return np.maximum.accumulate(np.maximum(growth, 1.0), axis=0)
+    return np.maximum.accumulate(np.maximum(growth, 0.0), axis=0)

@@ -82,8 +82,8 @@ class PSIMHints(PSIM, HintFilter):
             itself holds it, without g, squared and summed over standardised components.
         preimage_: g. preimage_errors_: root mean squared error of each candidate for g in cross-validation, by name.
         n_hint_, hint_names_, prior_mean_, prior_std_: as of `HintFilter`.
-        gap_growth_: what the variance of an estimate is to be multiplied by after 1, 2, .. observations that were
-            missed, measured on the validation (or training) trajectories.
+        gap_growth_: what is added to the variance of an estimate after 1, 2, .. observations that were missed, measured
+            on the validation (or training) trajectories.
 
     Example:
         >>> filter = PSIMHints(RandomFourierRidge(include_inputs=True, random_state=0), n_future=10)  # doctest: +SKIP

@@ -69,7 +69,7 @@ TASKS = {
     "pendulum-noisy": Task("noisy pendulum, full state", "rad, rad/s", "3.6", (20,)),
     "quadrotor": Task("quadrotor attitude, simulated", "rad", "3.7", (5, 20), "quadrotor"),
     "imu": Task("upward direction, recorded IMU", "rad", "3.7", (5,)),
-    "lift": Task("payload mass, simulated arm", "g", "3.8", (5, 40), "mass"),
+    "lift": Task("payload mass, simulated arm", "g", "3.8", (5, 20), "mass"),
     "payload": Task("payload mass, recorded lifts", "g", "3.8", (5,)),
 }
 

@@ -33,7 +33,7 @@ from beliefgym.scripts.reproductions.psim_methods import quiet
 
 VERSION = 1  # of the grids; cells made with another one run again
 VERSIONS = {
-    ("lift", group): 2 for group in ("ar", "imf", "psim-5", "psim-40")
+    ("lift", group): 2 for group in ("ar", "imf", "psim-5", "psim-20")
 }  # where a task's and group's are others
 
 
@@ -69,7 +69,7 @@ N_FINAL = 2  # settings that are fitted in full
 FOREST: dict[str, Any] = {"n_estimators": 30, "max_samples": 4000, "min_samples_leaf": 5, "max_features": 0.4}
 PREIMAGE_WAVES = 200
 N_PAST = 5  # k_p of the autoregressive filter, as in the thesis
-RATES, N_EPOCHS, PATIENCE = (3e-3, 1e-2), 80, 20  # of the recurrent network
+RATES, N_EPOCHS, PATIENCE = (1e-2,), 60, 15  # of the recurrent network: its default rate
 WIDE = {"lift", "payload"}  # tasks of many components: fewer iterations, fewer settings
 N_MOTIONS, MOTION_BINS = 4, 10  # of the recorded lifts: pick, hold, shake, lower
 Setting = dict[str, Any]
