@@ -192,8 +192,8 @@ NOTES = [
 ]
 NOTES_OF: dict[str, list[str]] = {
     "hints-pendulum": [
-        "Two of the hundred pendulums go over the top. Their angle counts on, but the x position is that of a turn less, "
-        "and nothing seen later tells by how many: they make up most of `at the end`.",
+        "Two of the hundred pendulums go over the top. Their angle counts on, but the x position is that of a turn "
+        "less, and nothing seen later tells by how many: they make up most of `at the end`.",
         "`started well`: its prior lies about each trajectory's own true start, 0.1 rad and rad/s off, which no other "
         "filter is told. The particle filter has 3,000 particles and the roughening that validation chose.",
         "A first version of the data, damped and less wide, was left before any test error was looked at: it was above "
@@ -211,9 +211,10 @@ NOTES_OF: dict[str, list[str]] = {
         "The simulated arm begins to lift after 3 of 8 s, and before that nothing shows the mass: no filter can do "
         "better than the prior there. The thesis has k_f = 40 at a rate that it does not name; here 20 is 2 s.",
         "`ridge, whole trajectory` is no filter: it is fitted to whole trajectories and answers at their end alone. "
-        "`IMF, told the phase` also sees which of its four motions the arm is in and how far, which that ridge knows by "
-        "its inputs' places. Beliefs of the IMF hold first and second moments.",
-        "The grid of the simulated arm was extended once, where validation had chosen its edge.",
+        "`IMF, told the phase` also sees which of its four motions the arm is in and how far, which that ridge knows "
+        "by its inputs' places. Beliefs of the IMF hold first and second moments.",
+        "Decided after first test errors had been seen: the grid of the simulated arm was moved, because validation had "
+        "chosen its edge; k_f = 40 there and 20 on the recorded lifts were left out, which took too long to compute.",
         "The recorded lifts have no licence: they are read for research, and nothing of them is distributed here.",
     ],
 }
