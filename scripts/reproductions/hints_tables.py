@@ -214,7 +214,7 @@ NOTES_OF: dict[str, list[str]] = {
         "`IMF, told the phase` also sees which of its four motions the arm is in and how far, which that ridge knows "
         "by its inputs' places. Beliefs of the IMF hold first and second moments.",
         "Decided after first test errors had been seen: the grid of the simulated arm was moved, because validation "
-        "had chosen its edge; k_f = 40 there and 20 on the recorded lifts were left out, which took too long to compute.",
+        "had chosen its edge; k_f = 40 there and 20 on the recorded lifts were left out: they take hours.",
         "The recorded lifts have no licence: they are read for research, and nothing of them is distributed here.",
     ],
 }
