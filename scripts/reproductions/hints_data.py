@@ -39,7 +39,7 @@ from beliefgym.scripts.reproductions.psim_data import Parts, split
 Floats = NDArray[np.float64]
 DAMPING, PENDULUM_DT, PENDULUM_STEPS = 0.0, 0.05, 99
 START_ANGLE, START_SPEED = 0.9 * np.pi, 1.0
-N_PENDULUMS, N_FLIGHTS, N_LIFTS = 100, 60, 100
+N_PENDULUMS, N_MANY, N_FLIGHTS, N_LIFTS = 100, 400, 60, 100
 FLIGHT_STEPS, IMU_DT = 199, 0.02
 EVERY = 2  # steps of a lift
 GRAMS = 1000.0
@@ -67,6 +67,7 @@ TASKS = {
     "pendulum-full": Task("pendulum, full state", "rad, rad/s", "3.6", (5, 10, 20), "full"),
     "pendulum-partial": Task("pendulum, angle alone", "rad", "3.6", (5, 10, 20), "partial"),
     "pendulum-noisy": Task("noisy pendulum, full state", "rad, rad/s", "3.6", (20,)),
+    "pendulum-many": Task("pendulum, full state, 400 trajectories", "rad, rad/s", "3.6", (), "full"),
     "quadrotor": Task("quadrotor attitude, simulated", "rad", "3.7", (5, 20), "quadrotor"),
     "imu": Task("upward direction, recorded IMU", "rad", "3.7", (5,)),
     "lift": Task("payload mass, simulated arm", "g", "3.8", (5, 20), "mass"),
@@ -110,7 +111,8 @@ def parts(name: str, fold: int, data: Path | None) -> Parts:
 def _whole(name: str, data: Path | None) -> tuple[Sequences, NDArray[Any]]:
     """All trajectories, and what is held out together."""
     if name.startswith("pendulum"):
-        swings = swinging(NOISY if name.endswith("noisy") else CLEAN, N_PENDULUMS, np.random.default_rng(36))
+        n = N_MANY if name.endswith("many") else N_PENDULUMS
+        swings = swinging(NOISY if name.endswith("noisy") else CLEAN, n, np.random.default_rng(36))
         if name.endswith("partial"):
             swings = _with_hints(swings, lambda hints: hints[:, :, :1], ("theta",))
         return swings, np.arange(len(swings))

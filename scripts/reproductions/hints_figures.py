@@ -27,11 +27,12 @@ PSIM = "#c2410c"
 
 def over_time(path: Path, by_task: dict[str, dict[str, dict[int, dict[str, Any]]]]) -> None:
     """One panel a task: mean error of each method after 1, 2, .. observations, with its standard error."""
-    shown = {name: found for name, found in by_task.items() if found}
+    shown = {name: found for name, found in by_task.items() if found and TASKS[name].horizons}
     if not shown:
         return
+    drawn: dict[str, Any] = {}
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(4.6 * len(shown), 4.2), layout="constrained")
+        figure = Figure(figsize=(4.6 * max(len(shown), 2), 4.4), layout="constrained")
         for ax, (name, found) in zip(
             figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True
         ):
@@ -41,14 +42,17 @@ def over_time(path: Path, by_task: dict[str, dict[str, dict[int, dict[str, Any]]
                     continue
                 mean, error = _curve(list(found[method].values()))
                 steps = np.arange(1, len(mean) + 1)
-                ax.plot(steps, mean, color=colour, label=method, lw=1.6 if method == longest else 1.1)
+                (line,) = ax.plot(steps, mean, color=colour, lw=1.8 if method == longest else 1.1)
                 ax.fill_between(
                     steps, np.maximum(mean - error, 0.3 * mean), mean + error, color=colour, alpha=0.15, lw=0
                 )
+                drawn.setdefault(method, line)
             ax.set_yscale("log")
             plain(ax, TASKS[name].title, "observations", f"error ({TASKS[name].unit})")
             numbers(ax.yaxis)
-            ax.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=7.5)
+        figure.legend(
+            drawn.values(), drawn.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=8
+        )
         save(figure, path)
 
 

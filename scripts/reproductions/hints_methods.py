@@ -58,6 +58,7 @@ GRIDS = {
     "pendulum-full": SWINGS,
     "pendulum-partial": SWINGS,
     "pendulum-noisy": SWINGS,
+    "pendulum-many": SWINGS,
     "quadrotor": ATTITUDES,
     "imu": ATTITUDES,
     "lift": Grid((1e-5, 1e-3, 1e-1), (2.0, 4.0), (1e-5, 1e-4, 1e-3), (1.0, 3.0)),
@@ -83,7 +84,7 @@ def groups(name: str) -> tuple[str, ...]:
         "ar",
         "imf",
         *(f"psim-{k}" for k in TASKS[name].horizons),
-        "gru",
+        *(("gru",) if TASKS[name].horizons else ()),
         *(("physics",) if has_physics(name) else ()),
         *(("whole", "told-phase") if name == "payload" else ()),
     )
@@ -91,7 +92,7 @@ def groups(name: str) -> tuple[str, ...]:
 
 def has_physics(name: str) -> bool:
     """Whether there is a filter that knows the system."""
-    return name in ("pendulum-full", "pendulum-noisy", "quadrotor", "imu")
+    return name in ("pendulum-full", "pendulum-noisy", "pendulum-many", "quadrotor", "imu")
 
 
 def results(group: str, name: str, parts: Parts, seed: int) -> dict[str, Any]:

@@ -19,6 +19,7 @@ def small(monkeypatch):
     for module, settings in {
         hints_data: {
             "N_PENDULUMS": 20,
+            "N_MANY": 20,
             "PENDULUM_STEPS": 29,
             "N_FLIGHTS": 12,
             "FLIGHT_STEPS": 30,
