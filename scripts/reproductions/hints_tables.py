@@ -283,7 +283,7 @@ def _rows(name: str, found: Results) -> list[Row]:
                     "error": error.to_dict(),
                     "sigma": float(every.std()),
                     "rmse_at_end": end,
-                    "coverage_95": inside,
+                    "coverage_95": None if np.isnan(inside) else inside,
                     "unit": task.unit,
                 },
             }
