@@ -98,7 +98,7 @@ class HintEstimator:
         z = (x - self._offset) * self._per_scale
         is_whole = np.isfinite(z).all()
         if not is_whole:
-            check_observed(x[None], self.missing)
+            check_observed(x, self.missing)
             if np.isinf(z).any():
                 raise ValueError(
                     f"observation: expected numbers like the training data's, got {x}: too large"
