@@ -91,6 +91,7 @@ class AutoregressiveFilter(Filter):
         z = self._scale.apply(rows)
         limit = np.where(Standardisation.of(z).constant, np.inf, LIMIT * np.abs(z).max(axis=0))
         self._bound = np.tile(limit, self.n_past)
+        self._note_beliefs(train)
         return self
 
     def _windows(self, z: Array, lengths: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -3,29 +3,36 @@
     m_0 = initial_belief,     m_{t+1} = F(m_t, x_t),     x_hat_t = predict_observation(m_t)           (Eq. 3.17)
 
 m_t has seen x_0 .. x_{t-1}, so that x_hat_t is a prediction, made before x_t is known. Everything goes over a whole
-batch at once: one call a time step for all trajectories. A filter that was fitted without actions takes them, where a
-caller hands them to every filter, and does not look at them.
+batch at once: one call a time step for all trajectories. With actions a filter is, by its `action_timing`,
 
-Reference: thesis proposal, Secs. 3.3.1 and 3.3.2. There time starts at 1; here at 0.
+    "previous"   m_{t+1} = F(m_t, x_t, a_{t-1}),    an estimate of what holds at t, to act on
+    "present"    m_{t+1} = F(m_t, x_t, a_t),        a prediction of x_{t+1}, which a_t leads to           (Sec. 4.2)
+
+and "none" for one fitted without actions, which takes them, where a caller hands them to every filter, and does not
+look at them.
+
+References: thesis proposal, Secs. 3.3.1, 3.3.2 and 4.2. There time starts at 1; here at 0.
 """
 
 from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator
 from sklearn.exceptions import NotFittedError
 
+from beliefgym.learning.action_coding import ActionCoding
 from beliefgym.learning.dynamics import STANDARDISATIONS, DivergenceWarning, Standardise
 from beliefgym.learning.filter_errors import FilterErrors
 from beliefgym.learning.sequences import Sequences
 from beliefgym.learning.standardisation import Standardisation
 
 Array = NDArray[np.float64]
+ActionTiming = Literal["none", "previous", "present"]
 
 
 class Filter(BaseEstimator, ABC):
@@ -37,9 +44,20 @@ class Filter(BaseEstimator, ABC):
 
     Attributes:
         n_obs_: components of an observation. belief_size: numbers in a belief.
+        action_timing: which action an update takes, see above. n_act_: columns of an action; 0 where none is looked at.
+        observation_names_, action_names_: names in the training data, or None.
+        belief_scale_: brings what `summary` shows to mean 0 and deviation 1 over the training data; None where it is
+            shown as it is.
     """
 
     standardise: Standardise
+    action_timing: ActionTiming = "none"
+    n_choices: int | None = None  # of a discrete action, which then is one column of whole numbers from 0
+    n_act_: int = 0
+    observation_names_: tuple[str, ...] | None = None
+    action_names_: tuple[str, ...] | None = None
+    belief_scale_: Standardisation | None = None
+    _action_coding: ActionCoding
     _fitted_attribute = "model_"  # there once a fit has given something to filter with
     _bound: Array | None = None
     _told_divergence = False
@@ -54,7 +72,10 @@ class Filter(BaseEstimator, ABC):
 
     @abstractmethod
     def _update(self, belief: Array, z: Array) -> Array:
-        """The next belief: (n, belief_size) and standardised observations (n, n_obs) -> (n, belief_size); no checks."""
+        """The next belief: (n, belief_size) and standardised observations (n, n_obs) -> (n, belief_size); no checks.
+
+        Where an update takes an action its code stands behind the observation.
+        """
 
     @abstractmethod
     def _observe(self, belief: Array) -> Array:
@@ -66,7 +87,7 @@ class Filter(BaseEstimator, ABC):
         for step in range(horizon):
             predicted[:, step] = self._observe(belief)
             if step + 1 < horizon:
-                belief = self._advance(belief, predicted[:, step])
+                belief = self._advance(belief, self._with_actions(predicted[:, step], None))
         return predicted
 
     @property
@@ -86,20 +107,21 @@ class Filter(BaseEstimator, ABC):
         Args:
             belief: (n, belief_size), of `initial_belief` or the last update.
             observation: (n, n_obs), in the units of the training data.
-            action: not looked at by a filter fitted without actions.
+            action: (n, n_act), in its own units: by `action_timing` the one before the observation (None where
+                there is none yet) or the one taken at it; not looked at by a filter fitted without actions.
 
         Returns:
             (n, belief_size), of the observations that follow.
 
         Raises:
-            NotFittedError, ValueError: not fitted; shapes, NaN or infinities, and where.
+            NotFittedError, ValueError: not fitted; shapes, NaN or infinities, and where; the action is missing.
         """
         b = self._checked_belief(belief)
         x = np.asarray(observation, dtype=np.float64)
         if x.shape != (len(b), self.n_obs_):
             raise ValueError(f"observation: expected shape {(len(b), self.n_obs_)}, got {x.shape}")
         check_finite("observation", x)
-        return self._advance(b, self._scale.apply(x))
+        return self._follow(b, self._scale.apply(x), self._checked_action(action, len(b)))
 
     def predict_observation(self, belief: ArrayLike) -> Array:
         """x_hat, the next observation that the belief expects: (n, belief_size) -> (n, n_obs)."""
@@ -109,23 +131,38 @@ class Filter(BaseEstimator, ABC):
         """The next `horizon` observations that the belief expects: x_hat_t .. x_hat_{t + horizon - 1}.
 
         Args:
-            belief: (n, belief_size). horizon: at least 1. actions: as of `update`.
+            belief: (n, belief_size). horizon: at least 1.
+            actions: a_t, a_{t+1}, .. (n, at least horizon - 1, n_act) for a filter whose `action_timing` is "present":
+                a_t leads to x_hat_{t+1}. None stands for the average action of the training data. Other filters expect
+                the actions of the policy that they were trained under, and do not look at these.
 
         Returns:
             (n, horizon, n_obs).
         """
         b = self._checked_belief(belief)
-        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-            raise ValueError(f"expected horizon to be a whole number of at least 1, got {horizon!r}")
-        return self._scale.invert(self._forecast(b, int(horizon)))
+        check_whole("horizon", horizon, 1)
+        if self.action_timing != "present":
+            return self._scale.invert(self._forecast(b, int(horizon)))
+        codes = np.zeros((len(b), int(horizon), self._action_coding.size))
+        if actions is not None:
+            a = np.asarray(actions, dtype=np.float64)
+            if a.ndim != 3 or len(a) != len(b) or a.shape[1] < horizon - 1 or a.shape[2] != self.n_act_:
+                raise ValueError(
+                    f"actions: expected shape ({len(b)}, at least {horizon - 1}, {self.n_act_}), got {a.shape}"
+                )
+            check_finite("actions", a)
+            for step in range(min(int(horizon), a.shape[1])):
+                codes[:, step] = self._action_coding(a[:, step])
+        return self._scale.invert(self._forecast_under(b, int(horizon), codes))
 
     def beliefs(self, sequences: Sequences) -> Array:
         """Filter whole trajectories: m_0 .. m_{n_steps + 1} of each.
 
         Returns:
-            (n_episodes, n_steps + 2, belief_size); after an episode's end its last belief stands.
+            (n_episodes, n_steps + 2, belief_size); after an episode's end its last belief stands. Where an update takes
+            the present action, the last one of an episode takes the average action: there is none any more.
         """
-        z = self._standardised(sequences)
+        z = self._driven(sequences)
         n, n_rows, _ = z.shape
         found = np.empty((n, n_rows + 1, self.belief_size))
         belief = self.initial_belief(n)
@@ -141,16 +178,22 @@ class Filter(BaseEstimator, ABC):
     def errors(self, sequences: Sequences, horizon: int = 1) -> FilterErrors:
         """Filter whole trajectories and compare what is predicted with what comes (Figs. 3.20 and Table 3.3).
 
+        A filter whose `action_timing` is "present" is told the actions that were taken.
+
         Args:
             sequences: trajectories. horizon: observations ahead at each step, at least 1.
         """
-        z = self._standardised(sequences)
+        z = self._driven(sequences)
         n, n_rows, _ = z.shape
         squared = np.full((n, n_rows, horizon), np.nan)
         belief = self.initial_belief(n)
         for t in range(n_rows):
             ahead = min(horizon, n_rows - t)
-            predicted = self._scale.invert(self._forecast(belief, ahead))
+            if self.action_timing == "present":
+                predicted = self._forecast_under(belief, ahead, z[:, t : t + ahead, self.n_obs_ :])
+            else:
+                predicted = self._forecast(belief, ahead)
+            predicted = self._scale.invert(predicted)
             difference = predicted - sequences.observations[:, t : t + ahead]
             squared[:, t, :ahead] = np.square(difference).sum(axis=2)
             belief = self._advance(belief, z[:, t])
@@ -158,6 +201,89 @@ class Filter(BaseEstimator, ABC):
         squared[np.arange(n_rows)[:, None] + np.arange(horizon) > last] = np.nan
         power = np.square(sequences.observations[sequences.observation_mask]).sum(axis=1).mean()
         return FilterErrors(squared, float(power))
+
+    @property
+    def summary_size(self) -> int:
+        """Numbers that `summary` shows of a belief."""
+        return self.belief_size
+
+    @property
+    def summary_names(self) -> tuple[str, ...]:
+        """A name for each of them."""
+        return tuple(f"belief_{i}" for i in range(self.summary_size))
+
+    def summary(self, belief: ArrayLike) -> Array:
+        """What an agent is shown of beliefs: (n, belief_size) -> (n, summary_size), on one scale where that is known."""
+        return self._summary(self._checked_belief(belief))
+
+    def _summary(self, belief: Array) -> Array:
+        return belief.copy() if self.belief_scale_ is None else self.belief_scale_.apply(belief)
+
+    def summaries(self, sequences: Sequences) -> Array:
+        """What an agent that acts at t can be shown, for every t of recorded trajectories.
+
+        That is the summary of m_{t+1}, which has seen x_t, or of m_t where an update takes the present action, which is
+        not chosen yet: then x_t belongs beside it.
+
+        Returns:
+            (n_episodes, n_steps + 1, summary_size); after an episode's end its last summary stands.
+        """
+        known = self._known(self.beliefs(sequences))
+        return self._summary(known.reshape(-1, known.shape[2])).reshape(*known.shape[:2], -1)
+
+    def _known(self, beliefs: Array) -> Array:
+        """Of m_0, m_1, .. those known at t = 0, 1, .. to who is to act: (n, n_rows + 1, size) -> (n, n_rows, size)."""
+        return beliefs[:, :-1] if self.action_timing == "present" else beliefs[:, 1:]
+
+    def _note_beliefs(self, train: Sequences) -> None:
+        """Take the scale of what `summary` shows from the training trajectories; the last act of a fit."""
+        told, self._told_divergence = self._told_divergence, True
+        rows = self._known(self.beliefs(train))[train.observation_mask]
+        self.belief_scale_, self._told_divergence = Standardisation.of(rows), told
+
+    def _follow(self, belief: Array, z: Array, action: Array | None) -> Array:
+        """The next belief of standardised observations (n, n_obs), and actions (n, n_act) in their own units.
+
+        Actions of NaN, or None for all, are not there yet. No checks.
+        """
+        return self._advance(belief, self._with_actions(z, action))
+
+    def _with_actions(self, z: Array, action: Array | None) -> Array:
+        """[z, u], the inputs of `_update`: (n, n_obs) -> (n, n_obs + code's size); z itself without actions."""
+        if self.action_timing == "none":
+            return z
+        coding = self._action_coding
+        inputs = np.zeros((len(z), self.n_obs_ + coding.size))
+        inputs[:, : self.n_obs_] = z
+        if action is not None:
+            inputs[:, self.n_obs_ :] = coding(action)
+        return inputs
+
+    def _driven(self, sequences: Sequences) -> Array:
+        """[z_t, u] of every t, u the code of the action that goes with x_t: (n, n_rows, n_obs + code's size)."""
+        return self._beside_actions(self._standardised(sequences), sequences)
+
+    def _beside_actions(self, z: Array, sequences: Sequences) -> Array:
+        if self.action_timing == "none":
+            return z
+        self._check_actions(sequences)
+        coding, mask = self._action_coding, sequences.step_mask
+        codes = np.zeros((*mask.shape, coding.size))
+        codes[mask] = coding(sequences.actions[mask])
+        inputs = np.zeros((*z.shape[:2], z.shape[2] + coding.size))
+        inputs[:, :, : z.shape[2]] = z
+        rows = slice(0, -1) if self.action_timing == "present" else slice(1, None)
+        inputs[:, rows, z.shape[2] :] = codes
+        return inputs
+
+    def _forecast_under(self, belief: Array, horizon: int, codes: Array) -> Array:
+        """`_forecast` under the coded actions (n, horizon, size); each prediction is taken for what comes."""
+        predicted = np.empty((len(belief), horizon, self.n_obs_))
+        for step in range(horizon):
+            predicted[:, step] = self._observe(belief)
+            if step + 1 < horizon:
+                belief = self._advance(belief, np.concatenate([predicted[:, step], codes[:, step]], axis=1))
+        return predicted
 
     def _advance(self, belief: Array, z: Array) -> Array:
         """`_update` within the bounds."""
@@ -197,7 +323,10 @@ class Filter(BaseEstimator, ABC):
             raise ValueError(
                 f"expected standardise to be one of {list(STANDARDISATIONS)}, got {self.standardise!r}"
             )
-        self.n_obs_ = train.n_obs
+        self.n_obs_, self.observation_names_ = train.n_obs, train.observation_names
+        self.n_act_, self.action_names_, self.belief_scale_ = 0, None, None
+        if self.action_timing != "none":
+            self._begin_actions(train, validation)
         self._told_divergence, self._bound = False, None
         rows = train.observations[train.observation_mask]
         self._scale: Standardisation = STANDARDISATIONS[self.standardise](rows)
@@ -210,6 +339,17 @@ class Filter(BaseEstimator, ABC):
                 stacklevel=3,
             )
 
+    def _begin_actions(self, train: Sequences, validation: Sequences | None) -> None:
+        """Take the actions' coding from the data to train on."""
+        if not train.n_act:
+            raise ValueError(f"expected trajectories with actions, got {train!r}; a filter without them is PSIM")
+        if validation is not None and validation.n_act != train.n_act:
+            raise ValueError(
+                f"expected validation with {train.n_act} actions as in training, got {validation.n_act}"
+            )
+        self._action_coding = ActionCoding.of(train.actions[train.step_mask], self.n_choices)
+        self.n_act_, self.action_names_ = train.n_act, train.action_names
+
     def _standardised(self, sequences: Sequences) -> Array:
         """(n_episodes, n_steps + 1, n_obs), 0 past an episode's end, where no belief is to leave its bounds."""
         self._check_fitted()
@@ -220,6 +360,32 @@ class Filter(BaseEstimator, ABC):
         z = self._scale.apply(sequences.observations)
         z[~sequences.observation_mask] = 0.0
         return z
+
+    def _check_actions(self, sequences: Sequences) -> None:
+        """Raise unless trajectories have the actions of the training data."""
+        if self.action_timing != "none" and sequences.n_act != self.n_act_:
+            raise ValueError(
+                f"expected trajectories with {self.n_act_} actions as at fit, got {sequences.n_act}"
+            )
+
+    def _checked_action(self, action: ArrayLike | None, n: int) -> Array | None:
+        """(n, n_act), or None where there is none; the message what is wrong with it."""
+        if self.action_timing == "none":
+            if action is not None and (np.ndim(action) != 2 or len(np.asarray(action)) != n):
+                raise ValueError(f"action: expected shape ({n}, n_act), got {np.shape(action)}")
+            return None
+        if action is None:
+            if self.action_timing == "previous":
+                return None
+            raise ValueError(
+                f"action: expected the action (n, {self.n_act_}) taken at this observation, got None: this "
+                f"{type(self).__name__} was fitted with actions"
+            )
+        a = np.asarray(action, dtype=np.float64)
+        if a.shape != (n, self.n_act_):
+            raise ValueError(f"action: expected shape {(n, self.n_act_)}, got {a.shape}")
+        check_finite("action", a)
+        return a
 
     def _checked_belief(self, belief: ArrayLike) -> Array:
         self._check_fitted()

@@ -84,6 +84,7 @@ class AutoregressiveHints(HintFilter):
         mask = train.observation_mask
         self._observer = fitted(Ridge(), self.beliefs(train)[:, :-1][mask], self._standardised(train)[mask])
         self.gap_growth_ = gap_growth(self, train if validation is None else validation)
+        self._note_beliefs(train)
         return self
 
     def _initial(self) -> Array:

@@ -124,6 +124,15 @@ class HintEstimator:
         a = None if action is None else np.asarray(action, dtype=np.float64)
         if a is not None and a.ndim != 1:
             raise ValueError(f"action: expected shape (n_act,), got {a.shape}")
+        if a is None and self.n_seen and hasattr(self.filter, "_action_coding"):
+            raise ValueError(
+                f"expected the action (n_act,) = ({self.filter.n_act_},) before this observation, got None: this "
+                f"{type(self.filter).__name__} was fitted with actions"
+            )
+        if a is not None:
+            self.filter._checked_action(a[None], 1)
+        if not self.n_seen:
+            a = None
         return self.filter._follow(self._belief[None], z[None], None if a is None else a[None])[0]
 
     def _prepare(self) -> None:
@@ -150,7 +159,7 @@ class HintEstimator:
 
 def _step_of(filter: Any) -> Step | None:
     """F of one row; None where the filter has more to do than to predict."""
-    if not isinstance(filter, PSIMHints):
+    if not isinstance(filter, PSIMHints) or filter.use_actions:
         return None
     size = filter.belief_size
     predict, inputs = row_predictor(filter.model_, size), np.empty(size + filter.n_obs_)

@@ -46,7 +46,7 @@ class HintFilter(Filter):
     """Base of the filters with `predict_hint`.
 
     A subclass begins its `fit` with `_begin` and `_begin_hints`, and implements, beside what `Filter` asks for,
-    `_read_hint`. One that knows better what to do without an observation, or that uses actions, has its own `_follow`.
+    `_read_hint`. One that knows better what to do without an observation has its own `_follow`.
 
     Attributes:
         n_hint_: components of the hint. hint_names_: their names, where the training data have them.
@@ -89,7 +89,8 @@ class HintFilter(Filter):
         Args:
             belief: (n, belief_size) m_t, of `initial_belief` or the last update.
             observation: (n, n_obs) x_t, in the units of the training data.
-            action: (n, n_act) the one before it, a_{t-1}; not looked at by a filter without actions.
+            action: (n, n_act) the one before it, a_{t-1}; None where there is none yet. Not looked at by a filter without
+                actions.
             missing: what NaN stands for: "raise" refuses it, "predict" takes it as not observed. The belief then moves
                 by its own prediction of what is missing, and by all of the rest.
 
@@ -106,10 +107,7 @@ class HintFilter(Filter):
         if missing not in get_args(Missing):
             raise ValueError(f"expected missing to be one of {get_args(Missing)}, got {missing!r}")
         check_observed(x, missing)
-        a = None if action is None else np.asarray(action, dtype=np.float64)
-        if a is not None and (a.ndim != 2 or len(a) != len(b)):
-            raise ValueError(f"action: expected shape ({len(b)}, n_act), got {a.shape}")
-        return self._follow(b, self._scale.apply(x), a)
+        return self._follow(b, self._scale.apply(x), self._checked_action(action, len(b)))
 
     def estimate_hints(self, sequences: Sequences) -> HintEstimate:
         """Filter whole trajectories; their hints are not looked at.
@@ -118,6 +116,7 @@ class HintFilter(Filter):
             Mean and standard deviation, (n_episodes, n_steps + 1, n_hint) each; NaN past an episode's end.
         """
         z = self._standardised(sequences)
+        self._check_actions(sequences)
         n, n_rows, _ = z.shape
         mean, std = (np.full((n, n_rows, self.n_hint_), np.nan) for _ in range(2))
         belief = self.initial_belief(n)
@@ -125,7 +124,7 @@ class HintFilter(Filter):
             going = np.flatnonzero(sequences.lengths >= t)
             if not len(going):
                 break
-            action = sequences.actions[going, t - 1] if t and sequences.n_act else None
+            action = sequences.actions[going, t - 1] if t and self.n_act_ and sequences.n_act else None
             belief[going] = self._follow(belief[going], z[going, t], action)
             mean[going, t], std[going, t] = self._read_hint(belief[going])
         return HintEstimate(mean, std)
@@ -146,7 +145,7 @@ class HintFilter(Filter):
         unseen = np.isnan(z)
         if unseen.any():
             z = np.where(unseen, self._observe(belief), z)
-        return self._advance(belief, z)
+        return super()._follow(belief, z, action)
 
     def _begin_hints(self, train: Sequences, validation: Sequences | None = None) -> None:
         """Check the hints and take their coordinates from those to train on; after `_begin`."""

@@ -48,7 +48,10 @@ def gap_growth(filter: HintFilter, sequences: Sequences) -> Array:
     growth = np.empty((longest, hints.shape[2]))
     for j in range(1, longest + 1):
         t = start + j - 1
-        belief = filter._advance(belief, filter._observe(belief))
+        action = None
+        if filter.n_act_:
+            action = np.where(t[:, None] > 0, sequences.actions[episode, t - 1], np.nan)
+        belief = filter._follow(belief, filter._observe(belief), action)
         truth = hints[episode, t]
         missed = np.square(filter._read_hint(belief)[0] - truth).mean(axis=0)
         seen = np.square(filter._read_hint(beliefs[episode, t + 1])[0] - truth).mean(axis=0)

@@ -131,6 +131,7 @@ class KalmanHints(HintFilter):
         with warnings.catch_warnings():  # `_begin` has told of constant components
             warnings.simplefilter("ignore", UserWarning)
             self.kalman_: KalmanFilter = kalman.fit(train)
+        self._note_beliefs(train)
         return self
 
     def _initial(self) -> Array:

@@ -137,6 +137,7 @@ class RecurrentHints(RecurrentFilter, HintFilter):
             validated = training.Examples.of(*parts, validation.lengths + 1, self.device)
         self._train(examples, validated, self._target.offset[None], scale, np.ones(1), rng)
         self._learn_rest(train, train if validation is None else validation)
+        self._note_beliefs(train)
         return self
 
     def _learn_rest(self, train: Sequences, judged: Sequences) -> None:

@@ -156,6 +156,7 @@ class InstrumentalVariableRegression(LinearFilter):
                 "trajectories, or a ridge may give a stable one",
                 stacklevel=2,
             )
+        self._note_beliefs(train)
         return self
 
     def _forecast(self, belief: Array, horizon: int) -> Array:

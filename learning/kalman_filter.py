@@ -163,6 +163,7 @@ class KalmanFilter(Filter):
             self._fit_known_states(train)
         else:
             self._fit_by_iterations(train, validation)
+        self._note_beliefs(train)
         return self
 
     def predict_variance(self, belief: ArrayLike) -> Array:

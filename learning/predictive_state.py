@@ -144,15 +144,15 @@ class PredictiveStateFilter(Filter):
         z[~sequences.observation_mask] = 0.0
         if self.target == "delta":
             base = self._base(z.reshape(-1, self.n_obs_)).reshape(*z.shape[:2], -1)
-        return TrainingData(*self._targets(sequences), z, base, sequences)
+        return TrainingData(*self._targets(sequences), z, base, sequences, self._beside_actions(z, sequences))
 
     def _base(self, z: Array) -> Array:
         """phi of an observation that stays as it is: (n, n_obs) -> (n, size)."""
         return self._phi(np.repeat(z[:, None], self.n_future, axis=1))
 
     def _completed(self, answer: Array, z: Array) -> Array:
-        """F(m, x) of the regressor's answer: (n, size) and (n, n_obs) -> (n, size)."""
-        return answer if self.target == "next" else answer + self._base(z)
+        """F(m, x) of the regressor's answer: (n, size) and (n, n_obs or more) -> (n, size)."""
+        return answer if self.target == "next" else answer + self._base(z[:, : self.n_obs_])
 
     def _targets(self, sequences: Sequences) -> tuple[Array, Counts]:
         """phi(f_t) of every t.
@@ -199,18 +199,18 @@ class PredictiveStateFilter(Filter):
         predicted = np.empty((len(belief), horizon, self.n_obs_))
         predicted[:, :k] = self._phi.read(self._state(belief))[:, :horizon]
         for step in range(k, horizon):
-            belief = self._advance(belief, self._observe(belief))
+            belief = self._advance(belief, self._with_actions(self._observe(belief), None))
             predicted[:, step] = self._phi.read_last(self._state(belief))
         return predicted
 
     def _history_error(self, sequences: Sequences) -> float:
         """The error that the histories hold: see `mean_next_error`."""
-        z = self._standardised(sequences)
-        beliefs = np.empty((*z.shape[:2], self.belief_size))
+        inputs = self._driven(sequences)
+        beliefs = np.empty((*inputs.shape[:2], self.belief_size))
         beliefs[:, 0] = self._initial()
-        for t in range(z.shape[1] - 1):
-            beliefs[:, t + 1] = self._advance(beliefs[:, t], z[:, t])
-        return self._error_of(beliefs, z, sequences.lengths)
+        for t in range(inputs.shape[1] - 1):
+            beliefs[:, t + 1] = self._advance(beliefs[:, t], inputs[:, t])
+        return self._error_of(beliefs, inputs[:, :, : self.n_obs_], sequences.lengths)
 
     def _error_of(self, beliefs: Array, z: Array, lengths: Counts) -> float:
         """The same, of beliefs (n, n_rows, belief_size) that are there already."""
@@ -236,19 +236,27 @@ class TrainingData:
     Args:
         targets, n_targets: of `PredictiveStateFilter._targets`. z: (n, n_rows, n_obs) standardised.
         base: (n, n_rows, size) what the regressor's answer is added to, or None for nothing.
-        sequences: the trajectories.
+        sequences: the trajectories. inputs: (n, n_rows, n_obs + code's size) z and the coded actions that go with it,
+            where the filter takes actions; None for z alone.
 
     Attributes:
-        sequences, z, base: as given. lengths: (n,) steps.
+        sequences, z, base, inputs: as given. lengths: (n,) steps.
         targets: (n, n_rows, size) phi(f_t), 0 where f_t is not complete. n_targets: (n,) those that are.
         answers: (n, n_rows - 1, size) what the regressor is to say of (m_t, x_t), where `is_learnt`.
     """
 
     def __init__(
-        self, targets: Array, n_targets: Counts, z: Array, base: Array | None, sequences: Sequences
+        self,
+        targets: Array,
+        n_targets: Counts,
+        z: Array,
+        base: Array | None,
+        sequences: Sequences,
+        inputs: Array | None = None,
     ) -> None:
         self.sequences, self.targets, self.n_targets = sequences, targets, n_targets
         self.z, self.base, self.lengths = z, base, sequences.lengths
+        self.inputs = z if inputs is None else inputs
         self.answers = targets[:, 1:] if base is None else targets[:, 1:] - base[:, :-1]
 
     @property

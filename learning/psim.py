@@ -166,6 +166,7 @@ class PSIM(PredictiveStateFilter):
             started = time.perf_counter()
         self.model_, self._phi = chosen
         self._learner = learner
+        self._note_beliefs(train)
         self._told_divergence = False
         return self
 
@@ -225,13 +226,13 @@ class PSIM(PredictiveStateFilter):
 
     def _first_hypothesis(self, regressor: Any, data: TrainingData) -> tuple[Any, tuple[Array, Array]]:
         """F_0, and the pairs that start the aggregate."""
-        n_inputs, size = data.z.shape[2] + data.targets.shape[2], data.targets.shape[2]
+        n_inputs, size = data.inputs.shape[2] + data.targets.shape[2], data.targets.shape[2]
         nothing = np.empty((0, n_inputs)), np.empty((0, size))
         if self.init == "prior":
             return Constant(self._first_belief if self.target == "next" else np.zeros(size)), nothing
         if self.init == "teacher":
             episode, t = np.nonzero(data.is_learnt)
-            pairs = self._inputs(data.targets[episode, t], data.z[episode, t]), data.answers[episode, t]
+            pairs = self._inputs(data.targets[episode, t], data.inputs[episode, t]), data.answers[episode, t]
         else:
             pairs = history_pairs(data, self.past_length)
         hypothesis = learner_for(regressor, "follow_the_leader", *pairs).frozen()
@@ -247,7 +248,7 @@ class PSIM(PredictiveStateFilter):
             Beliefs m_t (n_episodes, n_steps + 1, size), 0 past an episode's end, and how many were outside their
             bounds.
         """
-        z, bound = data.z, self._bound
+        z, bound = data.inputs, self._bound
         assert bound is not None
         n, n_rows, _ = z.shape
         beliefs = np.zeros((n, n_rows, self._phi.size))

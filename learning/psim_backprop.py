@@ -150,6 +150,7 @@ class BackpropPSIM(PredictiveStateFilter):
             self.history_["seconds"][epoch] = time.perf_counter() - started
         self.model_, self._phi = chosen
         self._told_divergence = False
+        self._note_beliefs(train)
         return self
 
     def _update(self, belief: Array, z: Array) -> Array:

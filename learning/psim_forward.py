@@ -103,6 +103,7 @@ class ForwardPSIM(PredictiveStateFilter):
         met[:, self.n_steps_ :] = belief[:, None]
         self._learn_to_read(met, z, np.minimum(n_targets, self.n_steps_))
         self._bound = np.append(bound, np.inf)
+        self._note_beliefs(train)
         return self
 
     @property

@@ -33,7 +33,7 @@ from sklearn.base import BaseEstimator
 from beliefgym.learning.aggregation import Algorithm, predict_unchecked
 from beliefgym.learning.dynamics import Standardise
 from beliefgym.learning.filter_errors import nan_mean
-from beliefgym.learning.filters import Filter, check_whole
+from beliefgym.learning.filters import ActionTiming, Filter, check_whole
 from beliefgym.learning.hint_features import (
     FromBelief,
     HintFeatures,
@@ -73,6 +73,9 @@ class PSIMHints(PSIM, HintFilter):
             left out. False learns from complete futures alone.
         hint_weight: scale of the standardised hints in a belief, against 1 of the observations. Regressors that measure
             distances (random Fourier features) see a hint among many observations better where it is above 1.
+        use_actions: let an update take the action before its observation, m_{t+1} = F(m_t, x_t, a_{t-1}); forecasts then
+            expect the actions of the policy trained under.
+        n_choices: number of choices of a discrete action, one column of whole numbers from 0; None for real numbers.
         n_iterations, init, discount, algorithm, step_size, standardise, belief_limit, progress_bar: as of `PSIM`. Hints
             are standardised as the observations are, by themselves.
         n_past: observations of the history of `init`; None for 2 max(k, 5).
@@ -105,6 +108,8 @@ class PSIMHints(PSIM, HintFilter):
         hints_from: Literal["hints", "states"] = "hints",
         pad_end: bool = False,
         hint_weight: float = 1.0,
+        use_actions: bool = False,
+        n_choices: int | None = None,
         n_iterations: int = 20,
         init: Init = "history",
         n_past: int | None = None,
@@ -123,6 +128,8 @@ class PSIMHints(PSIM, HintFilter):
         self.features = features
         self.preimage = preimage
         self.hints_from = hints_from
+        self.use_actions = use_actions
+        self.n_choices = n_choices
         self.n_iterations = n_iterations
         self.init = init
         self.n_past = n_past
@@ -174,6 +181,11 @@ class PSIMHints(PSIM, HintFilter):
             f"expected fit(train, validation): a {type(self).__name__} does not learn on, since its pre-image stands "
             "on the beliefs of all training trajectories; fit anew, or go on learning with PSIM"
         )
+
+    @property
+    def action_timing(self) -> ActionTiming:  # type: ignore[override]
+        """Whether an update takes the action before its observation."""
+        return "previous" if self.use_actions else "none"
 
     @property
     def past_length(self) -> int:
@@ -232,7 +244,8 @@ class PSIMHints(PSIM, HintFilter):
         targets[complete] = self._phi(flat[complete])
         z = np.pad(self._scale.apply(sequences.observations), ((0, 0), (0, 1), (0, 0)))
         z[:, :-1][~sequences.observation_mask] = 0.0
-        data = TrainingData(targets, n_targets, z, None, sequences)
+        inputs = np.pad(self._beside_actions(z[:, :-1], sequences), ((0, 0), (0, 1), (0, 0)))
+        data = TrainingData(targets, n_targets, z, None, sequences, inputs)
         data.lengths = sequences.lengths + 1
         return data
 
@@ -339,6 +352,8 @@ class InferenceMachineFilter(PSIMHints):
         features: HintFeatures = "first",
         preimage: Preimage = None,
         hints_from: Literal["hints", "states"] = "hints",
+        use_actions: bool = False,
+        n_choices: int | None = None,
         n_iterations: int = 20,
         init: Init = "history",
         n_past: int | None = None,
@@ -353,6 +368,8 @@ class InferenceMachineFilter(PSIMHints):
         self.features = features
         self.preimage = preimage
         self.hints_from = hints_from
+        self.use_actions = use_actions
+        self.n_choices = n_choices
         self.n_iterations = n_iterations
         self.init = init
         self.n_past = n_past

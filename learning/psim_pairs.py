@@ -85,12 +85,12 @@ def history_pairs(data: TrainingData, n_past: int) -> tuple[Array, Array]:
     Returns:
         (n, size + n_obs) and (n, size).
     """
-    past = past_windows(data.z, n_past)
+    past = past_windows(data.inputs, n_past)
     known = np.nonzero(np.arange(data.targets.shape[1]) < data.n_targets[:, None])
     state_of_past = Ridge(alpha=HISTORY_RIDGE).fit(past[known], data.targets[known])
     episode, t = np.nonzero(data.is_learnt)
     state = state_of_past.predict_unchecked(past[episode, t])
-    return np.concatenate([state, data.z[episode, t]], axis=1), data.answers[episode, t]
+    return np.concatenate([state, data.inputs[episode, t]], axis=1), data.answers[episode, t]
 
 
 def past_windows(z: Array, n_past: int) -> Array:

@@ -66,6 +66,8 @@ class LearningStream:
         if not 0 < forgetting <= 1:
             raise ValueError(f"expected forgetting in (0, 1], got {forgetting!r}")
         psim._check_fitted()
+        if psim.action_timing != "none":
+            raise TypeError(f"expected a PSIM without actions, got a {type(psim).__name__} fitted with them")
         learner = psim._held_learner()
         if forgetting < 1 and isinstance(learner, GradientSteps):
             raise ValueError(

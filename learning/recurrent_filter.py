@@ -222,6 +222,7 @@ class RecurrentFilter(Filter):
         scales = arrangement.offset, arrangement.scale
         self._train(examples, validated, *scales, self._weights_of_heads(), rng)
         self._arrangement = arrangement
+        self._note_beliefs(train)
         return self
 
     def _train(

@@ -146,6 +146,7 @@ class N4SID(LinearFilter):
                 "n_block_rows, may do without",
                 stacklevel=2,
             )
+        self._note_beliefs(train)
         return self
 
 

@@ -88,11 +88,12 @@ class GaussianPhysicsFilter(PhysicsFilter):
         mean, P = self._state(belief)
         columns = self._set.hint_columns
         if columns is None:
-            mean, P, _ = self._transform(self._hint, mean, P)
-            variance = np.diagonal(P, axis1=1, axis2=2)
-        else:
-            mean, variance = mean[:, columns], P[:, columns, columns]
-        return mean, np.sqrt(np.maximum(variance, 0.0))
+            return self._moments(belief, self._hint)
+        return mean[:, columns], np.sqrt(np.maximum(P[:, columns, columns], 0.0))
+
+    def _moments(self, belief: Array, function: Function) -> tuple[Array, Array]:
+        mean, P, _ = self._transform(function, *self._state(belief))
+        return mean, np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
 
     def _step(self, points: Array, action: Array) -> Array:
         """(n, k, n_state or n_state + noise_size), (n, n_action) -> (n, k, n_state), in one call of the system."""

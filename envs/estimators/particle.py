@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -149,10 +150,13 @@ class ParticleFilter(PhysicsFilter):
             self._rng = kept
 
     def _read_hint(self, belief: Array) -> tuple[Array, Array]:
+        return self._moments(belief, self._hint)
+
+    def _moments(self, belief: Array, function: Callable[[Array], Array]) -> tuple[Array, Array]:
         states, log_weights = self._split(belief)
-        hints, weights = self._hint(states), np.exp(log_weights)
-        mean = weighted_mean(hints, weights)
-        return mean, np.sqrt(weighted_mean(np.square(hints - mean[:, None]), weights))
+        values, weights = function(states), np.exp(log_weights)
+        mean = weighted_mean(values, weights)
+        return mean, np.sqrt(weighted_mean(np.square(values - mean[:, None]), weights))
 
     def _state(self, belief: Array) -> StateEstimate:
         states, log_weights = self._split(belief)

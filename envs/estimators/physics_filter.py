@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -61,8 +62,8 @@ class PhysicsFilter(HintFilter):
 
     `X(system=.., ..).fit(train)` takes the prior from data; `X.of(system, prior=.., ..)` is ready to use.
 
-    A subclass implements `_initial`, `_predict`, `_correct`, `_expect`, `_read_hint` and `_state`. The last number of
-    a belief is 0 before any update and 1 afterwards.
+    A subclass implements `_initial`, `_predict`, `_correct`, `_expect`, `_read_hint`, `_moments` and `_state`. The last
+    number of a belief is 0 before any update and 1 afterwards.
 
     Args:
         system: the true one, with its noise.
@@ -78,6 +79,7 @@ class PhysicsFilter(HintFilter):
     """
 
     standardise: Standardise = False
+    action_timing = "previous"
     _fitted_attribute = "prior_"
     prior_: StateEstimate
     _set: Parameters
@@ -237,7 +239,7 @@ class PhysicsFilter(HintFilter):
         return moved
 
     def _action(self, action: Array | None, n: int) -> Array:
-        """(n, n_action), zeros for None, or the message what is wrong with it."""
+        """(n, n_action), zeros for None and NaN, or the message what is wrong with it."""
         shape = (n, self.system.n_action)
         if action is None:
             return np.zeros(shape)
@@ -245,15 +247,51 @@ class PhysicsFilter(HintFilter):
             raise ValueError(
                 f"action: expected shape {shape} ({self.system.action_names}), got {action.shape}"
             )
+        action = np.where(np.isnan(action), 0.0, action)
         check_finite("action", action)
         return action
+
+    def _checked_action(self, action: ArrayLike | None, n: int) -> Array | None:
+        if action is None:
+            return None
+        a = self._action(np.asarray(action, dtype=np.float64), n)
+        check_finite("action", np.asarray(action, dtype=np.float64))
+        return a
+
+    def _check_actions(self, sequences: Sequences) -> None:
+        if sequences.n_act not in (0, self.n_act_):
+            raise ValueError(
+                f"expected trajectories with {self.n_act_} actions as the system, got {sequences!r}"
+            )
+
+    def _begin_actions(self, train: Sequences, validation: Sequences | None) -> None:
+        """The system says what its actions are."""
+
+    @property
+    def summary_size(self) -> int:
+        """Mean and standard deviation of each component of the system's full observation."""
+        self._check_fitted()
+        return 2 * len(self.system.observation_names)
+
+    @property
+    def summary_names(self) -> tuple[str, ...]:
+        """`mean[name]` of each component, then `std[name]` of each."""
+        names = self.system.observation_names
+        return (*(f"mean[{name}]" for name in names), *(f"std[{name}]" for name in names))
+
+    def _summary(self, belief: Array) -> Array:
+        """E[observe(s_t)] and its standard deviation, in the observation's units: what full sight would show."""
+        return np.concatenate(self._moments(belief, self.system.observe), axis=1)
+
+    @abstractmethod
+    def _moments(self, belief: Array, function: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Mean and standard deviation, (n, d) each, of a function of states (..., n_state) -> (..., d)."""
 
     def _leading_actions(self, sequences: Sequences) -> Array:
         """(n_episodes, n_steps + 1, n_action): the action before each observation; zeros where there is none."""
         n, n_steps, n_act = sequences.actions.shape
         size = self.system.n_action
-        if n_act not in (0, size):
-            raise ValueError(f"expected trajectories with {size} actions as the system, got {sequences!r}")
+        self._check_actions(sequences)
         before = np.zeros((n, n_steps + 1, size))
         if n_act:
             before[:, 1:] = sequences.actions
@@ -298,7 +336,8 @@ class PhysicsFilter(HintFilter):
         """Become the filter of these parameters and this prior."""
         self._set = setting
         self.n_obs_, self.n_hint_ = len(setting.observed), len(setting.hint_names)
-        self.hint_names_ = setting.hint_names
+        self.hint_names_, self.observation_names_ = setting.hint_names, setting.observed
+        self.n_act_, self.action_names_ = self.system.n_action, self.system.action_names
         self._scale = Standardisation.none(np.zeros((0, self.n_obs_)))
         self._hint_scale = Standardisation.none(np.zeros((0, self.n_hint_)))
         self.prior_ = StateEstimate(self._possible(mean[None]), covariance[None])
