@@ -49,7 +49,9 @@ if TYPE_CHECKING:
     from beliefgym.learning.multi_step_error import MultiStepErrors, multi_step_errors
     from beliefgym.learning.polynomial import PolynomialRidge
     from beliefgym.learning.psim import PSIM
+    from beliefgym.learning.psim_actions import PSIMActions
     from beliefgym.learning.psim_backprop import BackpropPSIM
+    from beliefgym.learning.psim_conditional import ConditionalPSIM
     from beliefgym.learning.psim_forward import ForwardPSIM
     from beliefgym.learning.psim_hints import InferenceMachineFilter, PSIMHints
     from beliefgym.learning.psim_stream import LearningStream
@@ -67,6 +69,7 @@ __all__ = [
     "AutoregressiveHints",
     "BackpropPSIM",
     "BackpropThroughTime",
+    "ConditionalPSIM",
     "DataAsDemonstrator",
     "DirectMultiStep",
     "DivergenceWarning",
@@ -90,6 +93,7 @@ __all__ = [
     "LearningStream",
     "LinearGaussianSystem",
     "MultiStepErrors",
+    "PSIMActions",
     "PSIMHints",
     "PolynomialRidge",
     "RandomForest",
@@ -126,6 +130,7 @@ _MODULES = {
     "AutoregressiveHints": "hint_autoregressive",
     "BackpropPSIM": "psim_backprop",
     "BackpropThroughTime": "backprop_through_time",
+    "ConditionalPSIM": "psim_conditional",
     "DataAsDemonstrator": "data_as_demonstrator",
     "DirectMultiStep": "direct_multi_step",
     "DivergenceWarning": "dynamics",
@@ -151,6 +156,7 @@ _MODULES = {
     "MultiStepErrors": "multi_step_error",
     "N4SID": "subspace_identification",
     "PSIM": "psim",
+    "PSIMActions": "psim_actions",
     "PSIMHints": "psim_hints",
     "PolynomialRidge": "polynomial",
     "RandomForest": "random_forest",

@@ -27,6 +27,8 @@ from beliefgym.learning.standardisation import Standardisation
 
 MODULES = {  # the classes that a file may name, and where they are
     "PSIM": "psim",
+    "PSIMActions": "psim_actions",
+    "ConditionalPSIM": "psim_conditional",
     "ForwardPSIM": "psim_forward",
     "BackpropPSIM": "psim_backprop",
     "AutoregressiveFilter": "autoregressive_filter",

@@ -25,11 +25,13 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from beliefgym.learning.action_coding import ActionCoding
 from beliefgym.learning.filter_archive import Archive, Shape, from_plain, plain
 from beliefgym.learning.filters import Filter
 from beliefgym.learning.future_features import FirstMoments, SecondMoments
 from beliefgym.learning.hint_files import hints_layout
 from beliefgym.learning.linear_gaussian import LinearGaussianSystem, StationaryGain, WhitenedObservation
+from beliefgym.learning.psim_actions import ObservationsAndActions
 from beliefgym.learning.whole_files import written_whole
 
 FORMAT_VERSION = 1
@@ -47,7 +49,7 @@ def save_filter(filter: Filter, path: str | os.PathLike[str]) -> Path:
     """Write a fitted filter to one file; an existing file is replaced in one move.
 
     Args:
-        filter: a `PSIM`, `ForwardPSIM`, `BackpropPSIM`, `PSIMHints` or `InferenceMachineFilter` with features "first"
+        filter: a `PSIM`, `PSIMActions`, `ConditionalPSIM`, `ForwardPSIM`, `BackpropPSIM`, `PSIMHints` or `InferenceMachineFilter` with features "first"
             or "second", a `KalmanFilter`, `N4SID`, `InstrumentalVariableRegression` or `AutoregressiveFilter`; its
             regressors, if any, `Ridge` or `RandomFourierRidge`.
         path: the file, used as it is (no ending is added; ".safetensors" is usual).
@@ -70,7 +72,9 @@ def save_filter(filter: Filter, path: str | os.PathLike[str]) -> Path:
     header |= plain(filter, leaving=("system",) if is_known else ("preimage",))
     archive = Archive(f"this {kind}", header, {}, is_loading=False)
     archive.whole(filter, "n_obs_")
+    _begin_actions(filter, archive)
     LAYOUTS[kind](filter, archive)
+    _shown(filter, archive)
     if not path.parent.is_dir():
         raise FileNotFoundError(
             f"cannot write {path}: the folder {path.parent} does not exist; create it first"
@@ -103,7 +107,9 @@ def load_filter(path: str | os.PathLike[str]) -> Any:
         filter = from_plain(header)
         archive = Archive(str(path), header, arrays, is_loading=True)
         filter.n_obs_ = archive.number("n_obs_")
+        _begin_actions(filter, archive)
         LAYOUTS[header["class"]](filter, archive)
+        _shown(filter, archive)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path} is damaged: its header is unreadable ({error!r}); write it again"
@@ -138,6 +144,33 @@ def _check_version(path: Path, version: Any) -> None:
         )
 
 
+def _begin_actions(filter: Any, archive: Archive) -> None:
+    """Names, and the coding of actions where an update takes them."""
+    for name in ("observation_names_", "action_names_"):
+        if archive.is_loading:
+            told = archive.header.get(name)  # files of before do not say
+            setattr(filter, name, None if told is None else tuple(str(one) for one in told))
+        else:
+            held = getattr(filter, name)
+            archive.header[name] = None if held is None else list(held)
+    if filter.action_timing == "none":
+        return
+    archive.whole(filter, "n_act_")
+    if archive.is_loading:
+        filter._action_coding = ActionCoding.__new__(ActionCoding)
+        filter._action_coding.n_choices = filter.n_choices
+    size = filter.n_act_ if filter.n_choices is None else filter.n_choices
+    archive.scale(filter._action_coding, "scale", size)
+
+
+def _shown(filter: Any, archive: Archive) -> None:
+    """The scale of what agents are shown, where it is known."""
+    if not archive.is_loading:
+        archive.header["has_belief_scale"] = filter.belief_scale_ is not None
+    if archive.header.get("has_belief_scale", False):
+        archive.scale(filter, "belief_scale_", filter.summary_size)
+
+
 def _predictive(filter: Any, archive: Archive) -> tuple[int, int]:
     """What predictive state filters share; the features and the regressor's inputs."""
     k, d = filter.n_future, filter.n_obs_
@@ -147,15 +180,25 @@ def _predictive(filter: Any, archive: Archive) -> tuple[int, int]:
             f"{filter.features!r}"
         )
     size = k * d if filter.features == "first" else 2 * k * d
+    is_joint = getattr(filter, "state", None) == "joint"
+    if is_joint:
+        size += k * n_code(filter)
     archive.scale(filter, "_scale", d)
     archive.array(filter, "_first_belief", (size,))
     if archive.is_loading:
         filter._phi = FirstMoments.__new__(FirstMoments if filter.features == "first" else SecondMoments)
         FirstMoments.__init__(filter._phi, int(k), d)
+        if is_joint:
+            filter._phi = ObservationsAndActions(int(k), d, n_code(filter))
     if filter.features == "second":
         archive.scale(filter._phi, "squares", k * d)
     archive.history(filter)
-    return size, size + d
+    return size, size + d + n_code(filter)
+
+
+def n_code(filter: Any) -> int:
+    """Numbers that a coded action adds to the inputs of an update."""
+    return 0 if filter.action_timing == "none" else int(filter._action_coding.size)
 
 
 def _psim(filter: Any, archive: Archive) -> None:
@@ -163,6 +206,20 @@ def _psim(filter: Any, archive: Archive) -> None:
     archive.array(filter, "_bound", (size,), holds="infinite")
     archive.whole(filter, "best_iteration_")
     filter.model_ = archive.regressor("model_", getattr(filter, "model_", None), n_inputs, size)
+
+
+def _psim_actions(filter: Any, archive: Archive) -> None:
+    _psim(filter, archive)
+    archive.array(filter, "effective_samples_", (int(filter.n_future),))
+    if archive.is_loading:
+        filter._target_block = None
+
+
+def _conditional_psim(filter: Any, archive: Archive) -> None:
+    _psim_actions(filter, archive)
+    k, size = int(filter.n_future), int(filter.n_future) * filter.n_obs_
+    each = n_code(filter) * (1 if filter.effects == "constant" else 1 + size)
+    archive.array(filter, "effects_", ((k - 1) * each, size))
 
 
 def _backprop_psim(filter: Any, archive: Archive) -> None:
@@ -264,6 +321,8 @@ def _kalman(filter: Any, archive: Archive) -> None:
 
 LAYOUTS: dict[str, Callable[[Any, Archive], None]] = {
     "PSIM": _psim,
+    "PSIMActions": _psim_actions,
+    "ConditionalPSIM": _conditional_psim,
     "ForwardPSIM": _forward_psim,
     "BackpropPSIM": _backprop_psim,
     "AutoregressiveFilter": _autoregressive,

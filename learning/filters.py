@@ -342,7 +342,9 @@ class Filter(BaseEstimator, ABC):
     def _begin_actions(self, train: Sequences, validation: Sequences | None) -> None:
         """Take the actions' coding from the data to train on."""
         if not train.n_act:
-            raise ValueError(f"expected trajectories with actions, got {train!r}; a filter without them is PSIM")
+            raise ValueError(
+                f"expected trajectories with actions, got {train!r}; a filter without them is PSIM"
+            )
         if validation is not None and validation.n_act != train.n_act:
             raise ValueError(
                 f"expected validation with {train.n_act} actions as in training, got {validation.n_act}"

@@ -40,7 +40,8 @@ def hints_layout(filter: Any, archive: Archive) -> None:
     archive.array(filter, "_bound", (size,), holds="infinite")
     archive.history(filter)
     archive.whole(filter, "best_iteration_")
-    filter.model_ = archive.regressor("model_", getattr(filter, "model_", None), size + d, size)
+    n_inputs = size + d + (filter._action_coding.size if filter.use_actions else 0)
+    filter.model_ = archive.regressor("model_", getattr(filter, "model_", None), n_inputs, size)
     reading, variance = filter._reading, filter._reading.variance
     is_read = reading.name == "belief"
     if is_read and archive.is_loading:

@@ -243,6 +243,7 @@ class TrainingData:
         sequences, z, base, inputs: as given. lengths: (n,) steps.
         targets: (n, n_rows, size) phi(f_t), 0 where f_t is not complete. n_targets: (n,) those that are.
         answers: (n, n_rows - 1, size) what the regressor is to say of (m_t, x_t), where `is_learnt`.
+        weights: (n, n_rows, n_blocks) importance weights of the targets, where there are any, else None.
     """
 
     def __init__(
@@ -257,6 +258,7 @@ class TrainingData:
         self.sequences, self.targets, self.n_targets = sequences, targets, n_targets
         self.z, self.base, self.lengths = z, base, sequences.lengths
         self.inputs = z if inputs is None else inputs
+        self.weights: Array | None = None
         self.answers = targets[:, 1:] if base is None else targets[:, 1:] - base[:, :-1]
 
     @property

@@ -159,7 +159,7 @@ class PSIM(PredictiveStateFilter):
                 best, self.best_iteration_, chosen = criterion, n, (self.model_, copy(self._phi))
             if learner is None:
                 inputs, targets = (np.concatenate(b) for b in zip(first_pairs, pairs.all(), strict=True))
-                learner = learner_for(regressor, self.algorithm, inputs, targets, self.step_size)
+                learner = self._new_learner(regressor, inputs, targets)
             elif n < self.n_iterations:
                 learner.refit()
             self._note(n, seconds=time.perf_counter() - started)
@@ -237,6 +237,10 @@ class PSIM(PredictiveStateFilter):
             pairs = history_pairs(data, self.past_length)
         hypothesis = learner_for(regressor, "follow_the_leader", *pairs).frozen()
         return hypothesis, pairs if self.init == "history" else nothing
+
+    def _new_learner(self, regressor: Any, X: Array, Y: Array) -> Learner:
+        """The learner of the aggregate, started on its first pairs."""
+        return learner_for(regressor, self.algorithm, X, Y, self.step_size)
 
     def _filter(self, data: TrainingData, pairs: Pairs) -> tuple[Array, int]:
         """The present filter over all trajectories at once, one step of time after the other.
