@@ -21,6 +21,7 @@ from beliefgym.agents.registry import (
     register_agent,
 )
 from beliefgym.agents.sb3_agent import SB3Agent
+from beliefgym.agents.sb3_log_probs import with_log_probs
 from beliefgym.agents.system_identification import SystemIdentification
 
 __all__ = [
@@ -43,4 +44,5 @@ __all__ = [
     "load_agent",
     "make_agent",
     "register_agent",
+    "with_log_probs",
 ]

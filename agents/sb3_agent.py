@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStac
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from beliefgym.agents.agent import Agent, episode_starts, require_box
+from beliefgym.agents.sb3_log_probs import draw_with_log_prob, log_half_widths, refuse_deterministic
 from beliefgym.wrappers.sb3 import SB3VecEnv
 from beliefgym.wrappers.task import Task
 
@@ -35,6 +36,15 @@ _ACTIVATIONS = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.EL
 class Memory(NamedTuple):
     """What an SB3 agent remembers between two calls of `predict`."""
 
+    stack: NDArray[Any] | None
+    recurrent: Any
+
+
+class _Shown(NamedTuple):
+    """What the model is shown in one call."""
+
+    observation: NDArray[Any]
+    starts: NDArray[np.bool_]
     stack: NDArray[Any] | None
     recurrent: Any
 
@@ -59,6 +69,11 @@ class UnitActions(VecEnvWrapper):
     def scale(self, actions: NDArray[Any]) -> NDArray[Any]:
         """[-1, 1] -> [low, high]."""
         return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+
+    @property
+    def log_stretch(self) -> float:
+        """log |det| of `scale`: what the log density of an action loses by it."""
+        return log_half_widths(self.low, self.high)
 
     def reset(self) -> VecEnvObs:
         """Pass on."""
@@ -92,6 +107,8 @@ class SB3Agent(Agent):
         ValueError: an unknown algorithm, an action space that it cannot act in, or an observation that cannot be
             stacked.
     """
+
+    explores_always = False  # so that `collect(..., deterministic=True)` asks `predict`
 
     def __init__(
         self,
@@ -148,23 +165,43 @@ class SB3Agent(Agent):
         deterministic: bool = False,
     ) -> tuple[NDArray[Any], Memory]:
         """See `Agent.predict`; the state holds the stacked frames and the LSTM's state."""
-        observation, single = self.batched(observation)
-        starts = episode_starts(state, episode_start, len(observation))
-        if self._normalizer is not None:
-            observation = np.asarray(self._normalizer.normalize_obs(observation))
-        stack = None
-        if self.n_stack > 1:
-            stack = self._push(None if state is None else state.stack, observation, starts)
-            observation = stack
+        shown, single = self._shown(observation, state, episode_start)
         action, recurrent = self.model.predict(
-            observation,
-            state=None if state is None else state.recurrent,
-            episode_start=starts,
-            deterministic=deterministic,
+            shown.observation, state=shown.recurrent, episode_start=shown.starts, deterministic=deterministic
         )
         if self._scaler is not None:
             action = self._scaler.scale(action)
-        return (action[0] if single else action), Memory(stack, recurrent)
+        return (action[0] if single else action), Memory(shown.stack, recurrent)
+
+    def predict_with_log_prob(
+        self,
+        observation: NDArray[Any],
+        state: Memory | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], Memory, NDArray[np.float64]]:
+        """Draw actions, as `predict` takes its arguments, and tell their log-probabilities.
+
+        The density is in the environment's units, of the action that is returned. PPO's and A2C's Gaussian actions
+        are returned unclipped; see sb3_log_probs.py for this and for every formula.
+
+        Returns:
+            action of one copy or (n, ...), the state for the next call, the log-probability, () or (n,).
+
+        Raises:
+            ValueError: deterministic=True, or TD3 or DDPG, whose actions have no density.
+        """
+        refuse_deterministic(deterministic)
+        shown, single = self._shown(observation, state, episode_start)
+        action, recurrent, log_prob = draw_with_log_prob(
+            self.model, shown.observation, shown.recurrent, shown.starts
+        )
+        if self._scaler is not None:
+            action = self._scaler.scale(action)
+            log_prob = log_prob - self._scaler.log_stretch
+        if single:
+            action, log_prob = action[0], log_prob[0]
+        return action, Memory(shown.stack, recurrent), log_prob
 
     def options(self) -> dict[str, Any]:
         """See `Agent.options`."""
@@ -223,6 +260,20 @@ class SB3Agent(Agent):
         if self.n_stack > 1:
             env = VecFrameStack(env, self.n_stack)
         return env, scaler, normalizer
+
+    def _shown(
+        self, observation: NDArray[Any], state: Memory | None, episode_start: NDArray[np.bool_] | None
+    ) -> tuple[_Shown, bool]:
+        """What the model sees of raw observations: a batch, normalised and stacked; and whether it was of one copy."""
+        observation, single = self.batched(observation)
+        starts = episode_starts(state, episode_start, len(observation))
+        if self._normalizer is not None:
+            observation = np.asarray(self._normalizer.normalize_obs(observation))
+        stack = None
+        if self.n_stack > 1:
+            stack = self._push(None if state is None else state.stack, observation, starts)
+            observation = stack
+        return _Shown(observation, starts, stack, None if state is None else state.recurrent), single
 
     def _push(
         self, stack: NDArray[Any] | None, observation: NDArray[Any], starts: NDArray[np.bool_]

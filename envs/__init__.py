@@ -15,6 +15,7 @@ from beliefgym.envs.catalogue import register_all
 from beliefgym.envs.collect import collect
 from beliefgym.envs.double_pendulum import DoublePendulum
 from beliefgym.envs.env import SystemEnv
+from beliefgym.envs.exploring_policy import EpsilonPolicy, GaussianPolicy
 from beliefgym.envs.helicopter import Helicopter
 from beliefgym.envs.helicopter_competition import HelicopterCompetition
 from beliefgym.envs.helicopter_funnel import HelicopterFunnel
@@ -48,7 +49,9 @@ __all__ = [
     "CartPoleBalance",
     "ComplementaryFilter",
     "DoublePendulum",
+    "EpsilonPolicy",
     "ExtendedKalmanFilter",
+    "GaussianPolicy",
     "HalfCheetahEnv",
     "Helicopter",
     "HelicopterCompetition",

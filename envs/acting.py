@@ -50,9 +50,12 @@ class Actor:
             return
         self._policy: Any = policy
         self.name = getattr(policy, "__qualname__", type(policy).__name__)
-        if callable(getattr(policy, "predict_with_log_prob", None)):
+        predicts = callable(getattr(policy, "predict", None))
+        # A policy with `explores_always` false has no density where it acts deterministically.
+        without = predicts and deterministic and not getattr(policy, "explores_always", True)
+        if callable(getattr(policy, "predict_with_log_prob", None)) and not without:
             self._form = "predict_with_log_prob"
-        elif callable(getattr(policy, "predict", None)):
+        elif predicts:
             self._form = "predict"
         elif callable(policy):
             self._form = "function"

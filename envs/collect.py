@@ -53,7 +53,10 @@ def collect(
       (or has a beliefgym system); with SAME_STEP, `infos["final_info"]["state"]` must give the state at each
       end. Otherwise no states are recorded;
     - action log probabilities, where the policy has `predict_with_log_prob(observation, state, episode_start,
-      deterministic) -> (action, state, log_prob)`, with log_prob (n,), and for the random policy;
+      deterministic) -> (action, state, log_prob)`, with log_prob (n,), and for the random policy. Where the
+      policy says `explores_always = False` and `deterministic` is true, it is asked by `predict` and none are
+      recorded: so do `SB3Agent` and `with_log_probs(model)` of beliefgym.agents. `GaussianPolicy` and
+      `EpsilonPolicy` make any policy one that explores and knows its log-probabilities;
     - component names, from the outermost layer that has `observation_names`, `action_names`, `state_names`,
       `hint_names` with as many names as components.
 
@@ -66,7 +69,7 @@ def collect(
             batch, of 1.
         n_episodes: number of episodes, at least 1.
         seed: at least 0.
-        deterministic: handed to `predict`.
+        deterministic: handed to `predict` or `predict_with_log_prob`.
         max_steps_per_episode: cut longer episodes off (truncated) at this many steps; needed where the
             environment sets no limit. On a vector environment it takes `reset(options={"reset_mask": ...})`.
         progress_bar: show finished episodes.
