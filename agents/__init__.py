@@ -1,6 +1,7 @@
 """What acts: experts, baselines and learned agents, all in Stable-Baselines3's face."""
 
 from beliefgym.agents.agent import Agent
+from beliefgym.agents.belief_policy import BeliefPolicy
 from beliefgym.agents.dad_control import DaDControl
 from beliefgym.agents.evaluation import Evaluation, evaluate
 from beliefgym.agents.expert import Expert
@@ -27,6 +28,7 @@ from beliefgym.agents.system_identification import SystemIdentification
 __all__ = [
     "Agent",
     "AgentSpec",
+    "BeliefPolicy",
     "DaDControl",
     "Evaluation",
     "Expert",

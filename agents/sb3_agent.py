@@ -13,24 +13,20 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import sb3_contrib
-import stable_baselines3
-import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from beliefgym.agents.agent import Agent, episode_starts, require_box
 from beliefgym.agents.sb3_log_probs import draw_with_log_prob, log_half_widths, refuse_deterministic
+from beliefgym.agents.sb3_models import algorithm_class, normalizer_moments, resolve, set_normalizer_moments
 from beliefgym.wrappers.sb3 import SB3VecEnv
 from beliefgym.wrappers.task import Task
 
 ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN", "RecurrentPPO", "TQC", "CrossQ")
 _CONTINUOUS = ("SAC", "TD3", "DDPG", "TQC", "CrossQ")
-_ACTIVATIONS = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
 
 
 class Memory(NamedTuple):
@@ -141,8 +137,8 @@ class SB3Agent(Agent):
         self.tensorboard_log = tensorboard_log
         self._learned = False
         env, self._scaler, self._normalizer = self._training_env(n_envs)
-        self.model: BaseAlgorithm = _algorithm_class(algorithm)(
-            env=env, seed=seed, device="cpu", tensorboard_log=tensorboard_log, **_resolve(self.arguments)
+        self.model: BaseAlgorithm = algorithm_class(algorithm)(
+            env=env, seed=seed, device="cpu", tensorboard_log=tensorboard_log, **resolve(self.arguments)
         )
 
     def learn(self, total_timesteps: int, callback: Any = None, progress_bar: bool = False) -> Self:
@@ -220,35 +216,18 @@ class SB3Agent(Agent):
         self.model.save(model)
         parts = {"model.zip": model.getvalue()}
         if self._normalizer is not None:
-            moments = io.BytesIO()
-            observation, reward = self._normalizer.obs_rms, self._normalizer.ret_rms
-            assert isinstance(observation, RunningMeanStd)
-            np.savez(
-                moments,
-                observation=np.stack([observation.mean, observation.var]),
-                reward=np.stack([reward.mean, reward.var]),
-                counts=np.array([observation.count, reward.count]),
-            )
-            parts["normalisation.npz"] = moments.getvalue()
+            parts["normalisation.npz"] = normalizer_moments(self._normalizer)
         return parts
 
     def restore(self, parts: Mapping[str, bytes]) -> None:
         """See `Agent.restore`. SB3's file holds pickled fields: open only files that you trust."""
         env = self.model.get_env()
-        self.model = _algorithm_class(self.algorithm).load(
+        self.model = algorithm_class(self.algorithm).load(
             io.BytesIO(parts["model.zip"]), env=env, device="cpu"
         )
         self._learned = True
         if self._normalizer is not None:
-            with np.load(io.BytesIO(parts["normalisation.npz"]), allow_pickle=False) as moments:
-                running: Any = zip(
-                    (self._normalizer.obs_rms, self._normalizer.ret_rms),
-                    (moments["observation"], moments["reward"]),
-                    moments["counts"],
-                    strict=True,
-                )
-                for rms, (mean, variance), count in running:
-                    rms.mean, rms.var, rms.count = mean, variance, float(count)
+            set_normalizer_moments(self._normalizer, parts["normalisation.npz"])
 
     def _training_env(self, n_envs: int) -> tuple[VecEnv, UnitActions | None, VecNormalize | None]:
         env: VecEnv = SB3VecEnv(self.task.make_vec(n_envs))
@@ -285,24 +264,3 @@ class SB3Agent(Agent):
         else:
             older = np.where(starts[:, None], 0.0, stack[:, size:]).astype(observation.dtype)
         return np.concatenate([older, observation], axis=1)
-
-
-def _algorithm_class(name: str) -> type[BaseAlgorithm]:
-    module = stable_baselines3 if hasattr(stable_baselines3, name) else sb3_contrib
-    found: type[BaseAlgorithm] = getattr(module, name)
-    return found
-
-
-def _resolve(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments with activations and schedules looked up by name."""
-    resolved = dict(arguments)
-    for name, value in arguments.items():
-        if isinstance(value, str) and value.startswith("linear:"):
-            start = float(value.removeprefix("linear:"))
-            resolved[name] = lambda remaining, start=start: start * remaining
-    policy = dict(resolved.get("policy_kwargs", {}))
-    if isinstance(policy.get("activation_fn"), str):
-        policy["activation_fn"] = _ACTIVATIONS[policy["activation_fn"]]
-    if policy:
-        resolved["policy_kwargs"] = policy
-    return resolved

@@ -1,0 +1,138 @@
+"""Filters for policies, by name, fitted to the data of a task; and which hints a task has to offer.
+
+Settings were chosen on validation episodes of noisy pendulums under random actions: `discount` below 1 forgets what the
+first, weak hypotheses met, which brings the error of the estimated velocity down to a half; see docs/beliefs.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
+
+from beliefgym.agents.step_recorder import Hint
+from beliefgym.learning import (
+    PSIM,
+    Filter,
+    InferenceMachineFilter,
+    PSIMActions,
+    PSIMHints,
+    RandomFourierRidge,
+)
+from beliefgym.wrappers.components import component_names, layers
+from beliefgym.wrappers.observation_noise import AddNoise
+from beliefgym.wrappers.task import Task
+
+Array = NDArray[np.float64]
+LEARNED = ("psim", "psim-actions", "psim-hints", "imf")
+KNOWN = ("particle", "ukf", "ekf")  # know the system; a ceiling
+LEAST_NOISE = (
+    0.01  # standard deviation of sensors that have none, in the units of the observation: a filter needs some
+)
+
+
+def new_filter(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> Filter:
+    """An unfitted filter.
+
+    Args:
+        name: of `LEARNED` or `KNOWN`. task: what it is for. seed: of its random features or particles.
+        options: in place of the settings of the same name; of the regressor "n_frequencies", "bandwidth" and "alpha".
+
+    Raises:
+        ValueError: an unknown name; a known filter for a task that is no beliefgym system.
+    """
+    if name in KNOWN:
+        return _known(name, task, seed, options)
+    if name not in LEARNED:
+        raise ValueError(f"expected filter to be one of {', '.join((*LEARNED, *KNOWN))}, got {name!r}")
+    chosen: dict[str, Any] = {
+        "n_future": 5,
+        "n_iterations": 30,
+        "discount": 0.8,
+        "n_frequencies": 300,
+        "bandwidth": None,
+        "alpha": 1e-4,
+        **options,
+    }
+    regressor = RandomFourierRidge(
+        n_frequencies=chosen.pop("n_frequencies"),
+        bandwidth=chosen.pop("bandwidth"),
+        alpha=chosen.pop("alpha"),
+        include_inputs=True,
+        random_state=seed,
+    )
+    if name == "psim":
+        return PSIM(regressor, **chosen)
+    chosen.setdefault("n_choices", _n_choices(task))
+    if name == "psim-actions":
+        return PSIMActions(regressor, **chosen)
+    chosen = {"use_actions": True, "preimage": "belief", **chosen}
+    if name == "psim-hints":
+        return PSIMHints(regressor, **chosen)
+    return InferenceMachineFilter(regressor, **{k: v for k, v in chosen.items() if k != "n_future"})
+
+
+def task_with_hints(task: Task) -> Task | None:
+    """The same task whose environment tells hints; None where it has none to offer."""
+    asked = Task(task.env_id, {**task.kwargs, "hint": True}, task.wrappers)
+    try:
+        asked.make_vec(1).close()
+    except TypeError:  # the environment knows no such parameter
+        return None
+    return asked
+
+
+def hint_of(task: Task) -> tuple[Hint, tuple[str, ...] | None]:
+    """What filters of this task are to estimate, made of its raw hints, and the names of the components.
+
+    Of a system whose hint is the whole state that is its full observation: what the fully observed sibling shows, in
+    which angles are cosines and sines. Other hints are taken as they are.
+    """
+    env = task.make_vec(1)
+    system = getattr(env.unwrapped, "system", None)
+    env.close()
+    if system is None or system.hint_names:
+        return (lambda raw: raw), None if system is None else tuple(system.hint_names)
+    return system.observe, tuple(system.observation_names)
+
+
+def _n_choices(task: Task) -> int | None:
+    env = task.make_vec(1)
+    space = env.single_action_space
+    env.close()
+    return int(space.n) if isinstance(space, Discrete) else None
+
+
+def _known(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> Filter:
+    """A filter of the task's own system, with the noise of its own sensors."""
+    from beliefgym.envs import ExtendedKalmanFilter, ParticleFilter, UnscentedKalmanFilter
+
+    env = task.make_vec(1)
+    system, names = getattr(env.unwrapped, "system", None), component_names(env)
+    noise = [layer.transform._std for layer in layers(env) if isinstance(_transform(layer), AddNoise)]  # type: ignore[union-attr]
+    env.close()
+    if system is None:
+        raise ValueError(
+            f"expected a task of a beliefgym system for the filter {name!r}, which knows its dynamics, got {task.label}"
+        )
+    std = np.maximum(np.sqrt(np.sum(np.square(noise), axis=0)) if noise else 0.0, LEAST_NOISE)
+    kinds: dict[str, Callable[..., Filter]] = {
+        "particle": ParticleFilter,
+        "ukf": UnscentedKalmanFilter,
+        "ekf": ExtendedKalmanFilter,
+    }
+    settings: dict[str, Any] = {
+        "system": system,
+        "observed": names,
+        "observation_noise_std": tuple(np.broadcast_to(std, len(names)).tolist()),
+    }
+    if name == "particle":
+        settings |= {"n_particles": 500, "roughening": 0.2, "random_state": seed}
+    return kinds[name](**{**settings, **options})
+
+
+def _transform(layer: Any) -> Any:
+    return getattr(layer, "transform", None)
