@@ -30,6 +30,15 @@ def _pendulums() -> None:
         max_episode_steps=200,
         partial={"Position": ("cos_theta", "sin_theta")},
     )
+    hide: Layer = ("PartialObservation", {"keep": ["cos_theta", "sin_theta"]})
+    for level, std, n_steps in (("Easy", 0.1, 200), ("Medium", 0.2, 150), ("Hard", 0.3, 100)):
+        register_composed(
+            f"PendulumPositionNoisy{level}",
+            system="beliefgym.envs.pendulum:Pendulum",
+            layers=[hide, ("ObservationNoise", {"std": std, "clip": True})],
+            exposes={"noise": ("ObservationNoise", "std")},
+            max_episode_steps=n_steps,
+        )
     register_system(
         "CartPoleSwingUp",
         "beliefgym.envs.cart_pole:CartPole",

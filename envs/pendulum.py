@@ -39,7 +39,9 @@ class Pendulum(System):
 
     Reward: -(theta^2 + 0.1 angular_velocity^2 + 0.001 torque^2), theta in [-pi, pi), before the step.
     Start: theta uniform in +-start_angle, angular_velocity uniform in +-start_speed. End: after 200 steps.
-    Versions: v0, the first. `beliefgym/PendulumPosition-v0` shows cos_theta and sin_theta only.
+    Versions: v0, the first. `beliefgym/PendulumPosition-v0` shows cos_theta and sin_theta only. The suites of
+    hidden-state tasks add noise to these: `beliefgym/PendulumPositionNoisyEasy-v0`, `..Medium-v0` and `..Hard-v0` with
+    the standard deviation 0.1, 0.2 and 0.3, clipped to -1..1, and end after 200, 150 and 100 steps.
 
     Args:
         gravity: m/s^2. mass: kg. length: m. damping: 1/s.
