@@ -54,7 +54,7 @@ def new_filter(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> 
         "discount": 0.8,
         "n_frequencies": 300,
         "bandwidth": None,
-        "alpha": 1e-4,
+        "alpha": 1e-5,
         **options,
     }
     regressor = RandomFourierRidge(

@@ -134,12 +134,32 @@ def _sb3(algorithm: str, **more: Any) -> Callable[[str], dict[str, Any]]:
     return lambda env_id: {**hyperparameters(algorithm, env_id), **more}
 
 
+def _belief(algorithm: str, filter: str) -> Callable[[str], dict[str, Any]]:
+    """The algorithm's usual options on beliefs, whatever they are without."""
+    return lambda env_id: {
+        **hyperparameters(algorithm, env_id),
+        "filter": filter,
+        **({} if filter in _LEARNED else {"filter": _known_filter(env_id)}),
+    }
+
+
+def _known_filter(env_id: str) -> str:
+    """Of the pendulums, whose angle is anywhere at first, a cloud of particles; elsewhere one Gaussian does."""
+    return "particle" if env_id.rpartition("/")[2].startswith("Pendulum") else "ekf"
+
+
 def _delays(env_id: str) -> dict[str, Any]:
     """Two observations make the state where positions alone are shown."""
     return {"delays": 2} if env_id.rpartition("-v")[0].endswith("Position") else {}
 
 
 _SB3 = "beliefgym.agents.sb3_agent:SB3Agent"
+_BELIEF = "beliefgym.agents.belief_policy:BeliefPolicy"
+_LEARNED = {
+    "psim": "a predictive state of observations alone",
+    "psim-actions": "a predictive state with actions",
+    "psim-hints": "a predictive state trained with the environment's hints",
+}
 
 for _spec in (
     AgentSpec(
@@ -168,5 +188,15 @@ for _spec in (
         "model-based rival: ensemble of probabilistic networks, trajectory sampling, cross-entropy planning",
     ),
     AgentSpec("recurrent-ppo", _SB3, "sb3-contrib's RecurrentPPO (LSTM)", _sb3("RecurrentPPO")),
+    *(
+        AgentSpec(
+            f"{algorithm.lower()}-{filter}",
+            _BELIEF,
+            f"SB3's {algorithm} on the last observation and {what}",
+            _belief(algorithm, filter),
+        )
+        for algorithm in ("PPO", "SAC")
+        for filter, what in {**_LEARNED, "known": "the belief of a filter that knows the system"}.items()
+    ),
 ):
     register_agent(_spec)

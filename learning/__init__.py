@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         LaggedError,
         WeightedMultiHorizon,
     )
+    from beliefgym.learning.belief_tracker import BeliefTracker
     from beliefgym.learning.data_as_demonstrator import DataAsDemonstrator
     from beliefgym.learning.direct_multi_step import DirectMultiStep
     from beliefgym.learning.dynamics import DivergenceWarning, DynamicsModel
@@ -69,6 +70,7 @@ __all__ = [
     "AutoregressiveHints",
     "BackpropPSIM",
     "BackpropThroughTime",
+    "BeliefTracker",
     "ConditionalPSIM",
     "DataAsDemonstrator",
     "DirectMultiStep",
@@ -130,6 +132,7 @@ _MODULES = {
     "AutoregressiveHints": "hint_autoregressive",
     "BackpropPSIM": "psim_backprop",
     "BackpropThroughTime": "backprop_through_time",
+    "BeliefTracker": "belief_tracker",
     "ConditionalPSIM": "psim_conditional",
     "DataAsDemonstrator": "data_as_demonstrator",
     "DirectMultiStep": "direct_multi_step",

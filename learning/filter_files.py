@@ -49,9 +49,10 @@ def save_filter(filter: Filter, path: str | os.PathLike[str]) -> Path:
     """Write a fitted filter to one file; an existing file is replaced in one move.
 
     Args:
-        filter: a `PSIM`, `PSIMActions`, `ConditionalPSIM`, `ForwardPSIM`, `BackpropPSIM`, `PSIMHints` or `InferenceMachineFilter` with features "first"
-            or "second", a `KalmanFilter`, `N4SID`, `InstrumentalVariableRegression` or `AutoregressiveFilter`; its
-            regressors, if any, `Ridge` or `RandomFourierRidge`.
+        filter: a `PSIM`, `PSIMActions`, `ConditionalPSIM`, `ForwardPSIM`, `BackpropPSIM`, `PSIMHints` or
+            `InferenceMachineFilter` with features "first" or "second", a `KalmanFilter`, `N4SID`,
+            `InstrumentalVariableRegression` or `AutoregressiveFilter`; its regressors, if any, `Ridge` or
+            `RandomFourierRidge`.
         path: the file, used as it is (no ending is added; ".safetensors" is usual).
 
     Returns:

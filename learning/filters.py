@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -33,6 +35,7 @@ from beliefgym.learning.standardisation import Standardisation
 
 Array = NDArray[np.float64]
 ActionTiming = Literal["none", "previous", "present"]
+COORDINATES = ("_scale", "_hint_scale", "_action_coding", "belief_scale_")
 
 
 class Filter(BaseEstimator, ABC):
@@ -58,6 +61,7 @@ class Filter(BaseEstimator, ABC):
     action_names_: tuple[str, ...] | None = None
     belief_scale_: Standardisation | None = None
     _action_coding: ActionCoding
+    _kept: Mapping[str, Any] = MappingProxyType({})  # coordinates of another filter, by attribute
     _fitted_attribute = "model_"  # there once a fit has given something to filter with
     _bound: Array | None = None
     _told_divergence = False
@@ -165,14 +169,15 @@ class Filter(BaseEstimator, ABC):
         z = self._driven(sequences)
         n, n_rows, _ = z.shape
         found = np.empty((n, n_rows + 1, self.belief_size))
-        belief = self.initial_belief(n)
-        found[:, 0] = belief
+        found[:, 0] = self.initial_belief(n)
         for t in range(n_rows):
             going = sequences.lengths >= t
-            belief = self._advance(belief, z[:, t])
-            if not going.all():
-                belief[~going] = found[~going, t]
-            found[:, t + 1] = belief
+            if going.all():
+                found[:, t + 1] = self._advance(found[:, t], z[:, t])
+                continue
+            found[:, t + 1] = found[:, t]
+            if going.any():
+                found[going, t + 1] = self._advance(found[going, t], z[going, t])
         return found
 
     def errors(self, sequences: Sequences, horizon: int = 1) -> FilterErrors:
@@ -213,7 +218,7 @@ class Filter(BaseEstimator, ABC):
         return tuple(f"belief_{i}" for i in range(self.summary_size))
 
     def summary(self, belief: ArrayLike) -> Array:
-        """What an agent is shown of beliefs: (n, belief_size) -> (n, summary_size), on one scale where that is known."""
+        """What an agent is shown: (n, belief_size) -> (n, summary_size), on one scale where that is known."""
         return self._summary(self._checked_belief(belief))
 
     def _summary(self, belief: Array) -> Array:
@@ -239,7 +244,13 @@ class Filter(BaseEstimator, ABC):
         """Take the scale of what `summary` shows from the training trajectories; the last act of a fit."""
         told, self._told_divergence = self._told_divergence, True
         rows = self._known(self.beliefs(train))[train.observation_mask]
-        self.belief_scale_, self._told_divergence = Standardisation.of(rows), told
+        self.belief_scale_ = self._coordinates("belief_scale_", Standardisation.of, rows)
+        self._told_divergence = told
+
+    def _coordinates(self, name: str, of: Callable[[Array], Any], rows: Array) -> Any:
+        """Those kept from another filter, or those of the data."""
+        kept = self._kept.get(name)
+        return of(rows) if kept is None else kept
 
     def _follow(self, belief: Array, z: Array, action: Array | None) -> Array:
         """The next belief of standardised observations (n, n_obs), and actions (n, n_act) in their own units.
@@ -305,6 +316,24 @@ class Filter(BaseEstimator, ABC):
         following = np.where(np.isnan(following), belief, following)
         return np.clip(following, -bound, bound)
 
+    def keep_coordinates(self, other: Self) -> Self:
+        """Fit in the coordinates of another filter of the same kind, so that beliefs of both mean the same.
+
+        Standardisation of observations, actions, hints and of what `summary` shows is then the other's, not that of the
+        data to fit to. With features "first" every number in a belief is such a quantity.
+
+        Args:
+            other: a fitted filter.
+
+        Raises:
+            TypeError: another kind of filter. NotFittedError: it is not fitted.
+        """
+        if type(other) is not type(self):
+            raise TypeError(f"expected a fitted {type(self).__name__}, got {type(other).__name__}")
+        other._check_fitted()
+        self._kept = {name: getattr(other, name) for name in COORDINATES if hasattr(other, name)}
+        return self
+
     def _begin(self, train: Sequences, validation: Sequences | None = None) -> None:
         """Check the data and take the coordinates from those to train on."""
         for sequences in (train,) if validation is None else (train, validation):
@@ -329,7 +358,7 @@ class Filter(BaseEstimator, ABC):
             self._begin_actions(train, validation)
         self._told_divergence, self._bound = False, None
         rows = train.observations[train.observation_mask]
-        self._scale: Standardisation = STANDARDISATIONS[self.standardise](rows)
+        self._scale: Standardisation = self._coordinates("_scale", STANDARDISATIONS[self.standardise], rows)
         constant = Standardisation.of(rows).constant
         if constant.any():
             names = train.observation_names
@@ -349,7 +378,12 @@ class Filter(BaseEstimator, ABC):
             raise ValueError(
                 f"expected validation with {train.n_act} actions as in training, got {validation.n_act}"
             )
-        self._action_coding = ActionCoding.of(train.actions[train.step_mask], self.n_choices)
+        if self.n_choices is not None:
+            check_whole("n_choices", self.n_choices, 2)
+        rows = train.actions[train.step_mask]
+        self._action_coding = self._coordinates(
+            "_action_coding", lambda actions: ActionCoding.of(actions, self.n_choices), rows
+        )
         self.n_act_, self.action_names_ = train.n_act, train.action_names
 
     def _standardised(self, sequences: Sequences) -> Array:

@@ -124,7 +124,7 @@ class HintEstimator:
         a = None if action is None else np.asarray(action, dtype=np.float64)
         if a is not None and a.ndim != 1:
             raise ValueError(f"action: expected shape (n_act,), got {a.shape}")
-        if a is None and self.n_seen and hasattr(self.filter, "_action_coding"):
+        if a is None and self.n_seen and self.filter.n_act_ and hasattr(self.filter, "_action_coding"):
             raise ValueError(
                 f"expected the action (n_act,) = ({self.filter.n_act_},) before this observation, got None: this "
                 f"{type(self.filter).__name__} was fitted with actions"

@@ -89,8 +89,8 @@ class HintFilter(Filter):
         Args:
             belief: (n, belief_size) m_t, of `initial_belief` or the last update.
             observation: (n, n_obs) x_t, in the units of the training data.
-            action: (n, n_act) the one before it, a_{t-1}; None where there is none yet. Not looked at by a filter without
-                actions.
+            action: (n, n_act) the one before it, a_{t-1}; None where there is none yet. Not looked at by a filter
+                fitted without actions.
             missing: what NaN stands for: "raise" refuses it, "predict" takes it as not observed. The belief then moves
                 by its own prediction of what is missing, and by all of the rest.
 
@@ -156,7 +156,7 @@ class HintFilter(Filter):
         self.hint_names_ = train.hint_names if self.hints_from == "hints" else train.state_names
         if validation is not None:
             self._hints_of(validation, "validation")
-        self._hint_scale = STANDARDISATIONS[self.standardise](rows)
+        self._hint_scale = self._coordinates("_hint_scale", STANDARDISATIONS[self.standardise], rows)
         self.prior_mean_, self.prior_std_ = hints[:, 0].mean(axis=0), hints[:, 0].std(axis=0)
         constant = Standardisation.of(rows).constant
         if constant.any():

@@ -11,8 +11,8 @@ are prescribed and do not look at the observations. Here the weight is
 
 with a blind reference mu: "uniform" is the thesis's weight; "marginal" is a normal distribution with the mean and the
 covariance of all recorded actions (of choices: their frequencies), which varies far less where the policy is not far
-from blind. With it Z_h, which the thesis leaves as "likely very hard to compute", is known: for any prescribed actions g
-sums to 1 over the observations, so that E_P[w | h] = sum_{tau^a} mu(tau^a) = 1 for every history. (With the thesis's
+from blind. With it Z_h, which the thesis leaves as "likely very hard to compute", is known: for any prescribed actions
+g sums to 1 over the observations, so that E_P[w | h] = sum_{tau^a} mu(tau^a) = 1 for every history. (With the thesis's
 weight it is the number, or the volume, of the action sequences, and also the same for every h.) That needs a policy
 which can take every action that mu takes.
 
@@ -22,7 +22,8 @@ later ones: per-decision weights (Precup, Sutton & Singh 2000),
     w_i = prod_{j < i} mu(a_{t+j}) / pi(a_{t+j} | ..).
 
 Garbled in the thesis and put right: Table 4.1 and Eq. 4.9 index the last factors by i = 1 .. k with histories from x_t
-on, which is the product above; in Table 4.1 "p(a_{t=1})" is a_{t+1}, and pi(a_{t+1} | h_t, x_t, x_t, ..) names x_t twice.
+on, which is the product above; in Table 4.1 "p(a_{t=1})" is a_{t+1}, and pi(a_{t+1} | h_t, x_t, x_t, ..) names x_t
+twice.
 
 References: thesis proposal, Sec. 4.2.1, Eqs. 4.7 to 4.14; Bowling, McCracken, James, Neufeld & Wilkinson, "Learning
 predictive state representations using non-blind policies", ICML 2006; Precup, Sutton & Singh, "Eligibility traces for
@@ -37,9 +38,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefgym.learning.sequences import Sequences
+from beliefgym.learning.standardisation import Standardisation
 
 Array = NDArray[np.float64]
 Reference = Literal["marginal", "uniform"]
+SINGULAR = (
+    1e-10  # eigenvalue of the actions' correlations below which one of them is the others', to rounding
+)
 
 
 class BlindReference:
@@ -64,14 +69,16 @@ class BlindReference:
                 self._log_frequencies: Array = np.log(counts / counts.sum())
             return
         self._mean = actions.mean(axis=0)
-        covariance = np.atleast_2d(np.cov(actions, rowvar=False, bias=True))
-        try:
-            root = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError as error:
+        each = Standardisation.of(actions)
+        z = each.apply(actions)
+        correlation = z.T @ z / len(z)
+        if each.constant.any() or np.linalg.eigvalsh(correlation)[0] < SINGULAR:
+            covariance = np.atleast_2d(np.cov(actions, rowvar=False, bias=True))
             raise ValueError(
                 "expected actions that vary in every component, and not all together, for the reference 'marginal', "
                 f"got the covariance {covariance.tolist()}; pass reference='uniform', or explore more widely"
-            ) from error
+            )
+        root = each.scale[:, None] * np.linalg.cholesky(correlation)
         self._whitening, self._log_scale = np.linalg.inv(root), float(np.log(np.diag(root)).sum())
 
     def log_density(self, actions: Array) -> Array:
@@ -119,6 +126,14 @@ def future_log_weights(ratios: Array, n_factors: int, n_rows: int) -> Array:
     summed[:, n_steps + 1 :] = summed[:, n_steps : n_steps + 1]
     start = np.arange(n_rows)[:, None]
     return summed[:, start + np.arange(n_factors + 1)] - summed[:, start]
+
+
+def check_truncate(truncate: float | None) -> None:
+    """Raise unless truncate is None or at least 1."""
+    if truncate is not None and not truncate >= 1:
+        raise ValueError(
+            f"expected truncate as a multiple of the mean weight, at least 1, or None, got {truncate!r}"
+        )
 
 
 def normalised_weights(log_weights: Array, truncate: float | None) -> Array:

@@ -5,8 +5,8 @@
 with h_t = x_0, a_0, .., x_{t-1}, a_{t-1}. F is learned by dataset aggregation as in `PSIM`. What the expectation is
 over depends on `importance`:
 
-    None         the policy that was recorded (Eq. 4.6, the naive joint model): the futures in m_t are the ones that this
-                 policy brings about, which another one does not
+    None         the policy that was recorded (Eq. 4.6, the naive joint model): the futures in m_t are those that this
+                 policy brings about, and another one does not
     "ordinary"   G_h, by targets that carry their weights: F answers w(tau) phi(tau), whose expectation is Eq. 4.14
     "weighted"   G_h, by weighted (self-normalised) importance sampling: least squares with the weights w(tau)
 
@@ -38,6 +38,7 @@ from beliefgym.learning.future_features import Features, FirstMoments
 from beliefgym.learning.importance_weights import (
     BlindReference,
     Reference,
+    check_truncate,
     effective_sample_share,
     future_log_weights,
     log_ratios,
@@ -141,10 +142,7 @@ class PSIMActions(PSIM):
         ):
             if value not in allowed:
                 raise ValueError(f"expected {name} to be one of {allowed}, got {value!r}")
-        if self.truncate is not None and not self.truncate >= 1:
-            raise ValueError(
-                f"expected truncate as a multiple of the mean weight, at least 1, or None, got {self.truncate!r}"
-            )
+        check_truncate(self.truncate)
         if self.state == "joint" and (self.features != "first" or self.target != "next"):
             raise ValueError("expected features='first' and target='next' with state='joint', got others")
         if self.importance is None:
@@ -172,8 +170,22 @@ class PSIMActions(PSIM):
             raise TypeError("expected importance=None to learn on; importance weights are of a whole fit")
         return super().partial_fit(train)
 
+    def chosen(self) -> LinearInFeatures:
+        """As of `PSIM`, without weighted importance sampling.
+
+        Raises:
+            TypeError: with importance "weighted", whose sums are of each block of targets, not of one regressor.
+        """
+        if self.importance == "weighted":
+            raise TypeError(
+                "expected importance=None or 'ordinary' for a regressor with its sums, got 'weighted'"
+            )
+        return super().chosen()
+
     def _begin_predictive(self, train: Sequences, validation: Sequences | None) -> TrainingData:
-        if self.importance is not None:  # first of all, so that what is missing is told before the work
+        if self.importance is not None and isinstance(
+            train, Sequences
+        ):  # what is missing is told before the work
             log_ratios(train, BlindReference("uniform", train.actions))
         return super()._begin_predictive(train, validation)
 
@@ -271,7 +283,14 @@ class PSIMActions(PSIM):
     def _n_targets(self, sequences: Sequences) -> Counts:
         """A joint test needs the action at its last observation too."""
         counts = super()._n_targets(sequences)
-        return np.maximum(counts - 1, 0) if self.state == "joint" else counts
+        if self.state != "joint":
+            return counts
+        if not (counts > 2).any():
+            raise ValueError(
+                f"expected a trajectory of at least n_future + 2 = {self.n_future + 2} observations with "
+                f"state='joint', got {len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower n_future"
+            )
+        return np.maximum(counts - 1, 0)
 
     def _targets(self, sequences: Sequences) -> tuple[Array, Counts]:
         if not isinstance(self._phi, ObservationsAndActions):

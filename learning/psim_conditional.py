@@ -5,7 +5,8 @@
 u the standardised actions: the belief m_t is what would be seen under the average action, and what other actions change
 is a part of its own, so that no policy is in the belief. The stages:
 
-    1   regress phi(f_t) on a window of the past for s_t; then phi_i(f_t) on (past, u_{t+j}, u_{t+j} s_t; j < i), for B, C
+    1   regress phi(f_t) on a window of the past for s_t; then phi_i(f_t) on (past, u_{t+j}, u_{t+j} s_t; j < i), for
+        B and C
     2   learn F on the futures without what their actions did, phi_i(f_t) - sum_j (B_ij + C_ij s_t) u_{t+j}, by dataset
         aggregation as in `PSIM`: m_{t+1} = F(m_t, x_t, a_t)
 
@@ -33,6 +34,7 @@ from beliefgym.learning.dynamics import Standardise, Target
 from beliefgym.learning.importance_weights import (
     BlindReference,
     Reference,
+    check_truncate,
     effective_sample_share,
     future_log_weights,
     log_ratios,
@@ -64,8 +66,8 @@ class ConditionalPSIM(PSIM):
 
     Attributes:
         model_, best_iteration_, history_: as of `PSIM`.
-        effects_: (n_effects, k n_obs) B and C, zero where an action comes after the observation. effective_samples_: (k,)
-            share of effective samples for each observation to come; ones without importance.
+        effects_: (n_effects, k n_obs) B and C, zero where an action comes after the observation.
+        effective_samples_: (k,) share of effective samples for each observation to come; ones without importance.
 
     Example:
         >>> filter = ConditionalPSIM(n_future=5).fit(train, validation)  # doctest: +SKIP
@@ -139,6 +141,7 @@ class ConditionalPSIM(PSIM):
             raise ValueError(f"expected effects to be one of {get_args(Effects)}, got {self.effects!r}")
         if not (np.isfinite(self.effect_ridge) and self.effect_ridge >= 0):
             raise ValueError(f"expected effect_ridge finite and at least 0, got {self.effect_ridge!r}")
+        check_truncate(self.truncate)
 
     def partial_fit(self, train: Sequences) -> Any:
         """Not here.
@@ -215,11 +218,13 @@ class ConditionalPSIM(PSIM):
 
     def _effect_inputs(self, states: Array, codes: Array) -> Array:
         """(n, size) and (n, k - 1, c) -> (n, n_effects): for each action its code, and with C its code times states."""
-        n = len(codes)
+        n, n_codes, c = codes.shape
         if self.effects == "constant":
-            return codes.reshape(n, -1)
+            return codes.reshape(n, n_codes * c)
         products = codes[:, :, :, None] * states[:, None, None]
-        return np.concatenate([codes, products.reshape(*codes.shape[:2], -1)], axis=2).reshape(n, -1)
+        each = c * (1 + states.shape[1])
+        both = np.concatenate([codes, products.reshape(n, n_codes, each - c)], axis=2)
+        return both.reshape(n, n_codes * each)
 
     def _changed(self, states: Array, codes: Array, effects: Array) -> Array:
         """What later actions change: (n, size) and (n, k - 1, c) -> (n, k n_obs)."""

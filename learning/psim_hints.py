@@ -73,8 +73,8 @@ class PSIMHints(PSIM, HintFilter):
             left out. False learns from complete futures alone.
         hint_weight: scale of the standardised hints in a belief, against 1 of the observations. Regressors that measure
             distances (random Fourier features) see a hint among many observations better where it is above 1.
-        use_actions: let an update take the action before its observation, m_{t+1} = F(m_t, x_t, a_{t-1}); forecasts then
-            expect the actions of the policy trained under.
+        use_actions: let an update take the action before its observation, m_{t+1} = F(m_t, x_t, a_{t-1}); forecasts
+            then expect the actions of the policy trained under.
         n_choices: number of choices of a discrete action, one column of whole numbers from 0; None for real numbers.
         n_iterations, init, discount, algorithm, step_size, standardise, belief_limit, progress_bar: as of `PSIM`. Hints
             are standardised as the observations are, by themselves.

@@ -1,6 +1,7 @@
 """What changes an observation or an action; the forms for vector environments are in `vector`."""
 
 from beliefgym.wrappers.action_history import ActionHistory
+from beliefgym.wrappers.belief_observation import BeliefObservation
 from beliefgym.wrappers.components import component_names
 from beliefgym.wrappers.discrete_actions import DiscreteActions
 from beliefgym.wrappers.observation_delay import ObservationDelay
@@ -17,6 +18,7 @@ from beliefgym.wrappers.task import Task  # isort: skip  (it uses the names abov
 
 __all__ = [
     "ActionHistory",
+    "BeliefObservation",
     "DiscreteActions",
     "ObservationDelay",
     "ObservationNoise",

@@ -18,7 +18,14 @@ import beliefgym.wrappers as single_wrappers
 import beliefgym.wrappers.vector as vector_wrappers
 from beliefgym.envs.registration import NAMESPACE, has_native_vector_form
 
-NAMES = ("PartialObservation", "ObservationNoise", "ObservationDelay", "ActionHistory", "DiscreteActions")
+NAMES = (
+    "PartialObservation",
+    "ObservationNoise",
+    "ObservationDelay",
+    "ActionHistory",
+    "DiscreteActions",
+    "BeliefObservation",
+)
 
 
 @dataclass(frozen=True)
@@ -88,10 +95,19 @@ class Task:
         return env
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as it stands in records and saved agents."""
-        plain: dict[str, Any] = json.loads(
-            json.dumps({"env_id": self.env_id, "kwargs": self.kwargs, "wrappers": self.wrappers})
-        )
+        """Plain data, as it stands in records and saved agents.
+
+        Raises:
+            TypeError: an argument that JSON does not hold, such as a filter instead of its file's path.
+        """
+        try:
+            text = json.dumps({"env_id": self.env_id, "kwargs": self.kwargs, "wrappers": self.wrappers})
+        except TypeError as error:
+            raise TypeError(
+                f"the task {self.label!r} does not go into plain data: {error}; pass numbers, strings, lists and "
+                "mappings, and a filter as the path of the file that save_filter wrote"
+            ) from error
+        plain: dict[str, Any] = json.loads(text)
         return plain
 
     @classmethod

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
@@ -18,14 +18,20 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from beliefgym.wrappers.action_history import AppendActions, check_length
+from beliefgym.wrappers.belief_observation import AppendBelief
 from beliefgym.wrappers.discrete_actions import ActionGrid, SpaceKind
 from beliefgym.wrappers.observation_delay import DelayObservations, Fill, check_delay
 from beliefgym.wrappers.observation_noise import AddNoise, Std
 from beliefgym.wrappers.partial_observation import KeepComponents
 from beliefgym.wrappers.transform import VectorTransformObservation, require_vector
 
+if TYPE_CHECKING:
+    from beliefgym.learning.belief_tracker import Show
+    from beliefgym.wrappers.belief_observation import FilterOrPath
+
 __all__ = [
     "ActionHistory",
+    "BeliefObservation",
     "DiscreteActions",
     "ObservationDelay",
     "ObservationNoise",
@@ -85,6 +91,28 @@ class ActionHistory(VectorTransformObservation):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], length: int) -> None:
         super().__init__(env, partial(AppendActions, length=check_length(length)))
+
+
+class BeliefObservation(VectorTransformObservation):
+    """Appends the belief of a fitted filter about every copy; see `beliefgym.wrappers.BeliefObservation`.
+
+    Args:
+        env: a vector environment.
+        filter: a fitted `Filter`, or the path of a file written by `save_filter`.
+        include_observation: False shows the belief alone.
+        show: "belief" or "hint".
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        filter: FilterOrPath,
+        include_observation: bool = True,
+        show: Show = "belief",
+    ) -> None:
+        super().__init__(
+            env, partial(AppendBelief, filter=filter, include_observation=include_observation, show=show)
+        )
 
 
 class DiscreteActions(VectorActionWrapper[Any, Any, Any, Any]):

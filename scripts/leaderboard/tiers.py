@@ -19,6 +19,14 @@ from beliefgym.wrappers.task import Task
 
 POSITION_ONLY = ("beliefgym/PendulumPosition-v0", "beliefgym/CartPoleSwingUpPosition-v0")
 REFERENCES = {"random": 0, "expert": 0}  # agents that do not train
+BELIEF_PENDULUMS = (
+    POSITION_ONLY[0],
+    *(f"beliefgym/PendulumPositionNoisy{level}-v0" for level in ("Easy", "Medium", "Hard")),
+)
+OF_SAC, OF_PPO = (
+    tuple(f"{algorithm}{sees}" for sees in ("-psim-hints", "-psim-actions", "-psim", "-stack", ""))
+    for algorithm in ("sac", "ppo")
+)
 RUNNER = "beliefgym.scripts.run_cell:run_cell"
 
 TIERS: dict[str, dict[str, Any]] = {
@@ -53,6 +61,25 @@ TIERS: dict[str, dict[str, Any]] = {
         "eval_episodes": 300,
         "time_limit_s": 3600,
     },
+    "belief-pendulum": {
+        "description": "Position-only pendulums, exact and with the suites' noise: SAC on the last observation, on four, "
+        "on learned beliefs and on the belief of a filter that knows the system, at equal steps (those that filters are "
+        "fitted to among them); recurrent PPO and full sight beside.",
+        "tasks": BELIEF_PENDULUMS,
+        "steps": {**REFERENCES, **dict.fromkeys(("recurrent-ppo", "sac-known", *OF_SAC), 20_000)},
+        "also": (("beliefgym/Pendulum-v0", {**REFERENCES, "sac": 20_000}),),
+        "seeds": 10,
+        "eval_episodes": 300,
+        "time_limit_s": 1800,
+    },
+    "belief-ppo": {
+        "description": "The same with PPO, on an exact and a noisy pendulum.",
+        "tasks": BELIEF_PENDULUMS[:3:2],
+        "steps": {**REFERENCES, **dict.fromkeys(("ppo-known", *OF_PPO), 100_000)},
+        "seeds": 3,
+        "eval_episodes": 300,
+        "time_limit_s": 1800,
+    },
     "difficulty": {
         "description": "Every environment and an agent without memory: what hiding a part of the state costs it.",
         "tasks": tuple(registered_ids()),
@@ -75,9 +102,10 @@ def tier(name: str) -> Grid:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise LeaderboardError(f"there is no tier {name!r}{hint} (known: {', '.join(TIERS)})")
     plan = TIERS[name]
-    cells = build_cells(
-        [Task(env_id) for env_id in plan["tasks"]], plan["steps"], range(plan["seeds"]), plan["eval_episodes"]
-    )
+    seeds, episodes = range(plan["seeds"]), plan["eval_episodes"]
+    cells = build_cells([Task(env_id) for env_id in plan["tasks"]], plan["steps"], seeds, episodes)
+    for env_id, steps in plan.get("also", ()):  # what only one task has
+        cells += build_cells([Task(env_id)], steps, seeds, episodes)
     return Grid(name, cells, time_limit_s=plan["time_limit_s"], description=plan["description"])
 
 

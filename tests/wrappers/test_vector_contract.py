@@ -12,9 +12,41 @@ from gymnasium.wrappers import TimeLimit
 
 import beliefgym.wrappers as single
 import beliefgym.wrappers.vector as vector
+from beliefgym.learning import Sequences
+from beliefgym.learning.filters import ActionTiming, Filter
 
 N = 3
 Stack = list[tuple[str, dict[str, Any]]]
+
+
+class Leaky(Filter):
+    """m_{t+1} = m_t / 2 + (x_t, a_t or a_{t-1}): no matrix product, whose rounding depends on the number of copies."""
+
+    def __init__(self, timing: ActionTiming, standardise: bool = True) -> None:
+        self.timing, self.standardise = timing, standardise
+        self.action_timing = timing
+
+    def fit(self, train: Sequences, validation: Sequences | None = None) -> Leaky:
+        self._begin(train, validation)
+        self.model_ = None
+        return self
+
+    def _initial(self) -> Any:
+        return np.ones(self.n_obs_ + (self._action_coding.size if self.n_act_ else 0))
+
+    def _update(self, belief: Any, z: Any) -> Any:
+        return 0.5 * belief + z
+
+    def _observe(self, belief: Any) -> Any:
+        return belief[:, : self.n_obs_]
+
+
+def leaky(timing: ActionTiming) -> dict[str, Any]:
+    """A filter of two observations and one action."""
+    rng = np.random.default_rng(0)
+    data = Sequences.from_observations(rng.standard_normal((5, 9, 2)), actions=rng.random((5, 8, 1)))
+    return {"filter": Leaky(timing).fit(data)}
+
 
 STACKS: dict[str, Stack] = {
     "partial": [("PartialObservation", {"keep": [-1, 0]})],
@@ -26,12 +58,22 @@ STACKS: dict[str, Stack] = {
     "delay 9 zeros": [("ObservationDelay", {"steps": 9, "fill": "zeros"})],
     "history 1": [("ActionHistory", {"length": 1})],
     "history 4": [("ActionHistory", {"length": 4})],
+    "belief": [("PartialObservation", {"keep": [0, 1]}), ("BeliefObservation", leaky("none"))],
+    "belief, previous action": [
+        ("PartialObservation", {"keep": [0, 1]}),
+        ("BeliefObservation", {**leaky("previous"), "include_observation": False}),
+    ],
+    "belief, present action": [
+        ("PartialObservation", {"keep": [0, 1]}),
+        ("BeliefObservation", leaky("present")),
+    ],
     "delayed noise": [("ObservationNoise", {"std": 0.1}), ("ObservationDelay", {"steps": 2})],
     "noisy delay": [("ObservationDelay", {"steps": 2, "fill": "zeros"}), ("ObservationNoise", {"std": 0.1})],
     "everything": [
         ("PartialObservation", {"keep": [0, 1]}),
         ("ObservationNoise", {"std": 0.1}),
         ("ObservationDelay", {"steps": 2}),
+        ("BeliefObservation", leaky("previous")),
         ("ActionHistory", {"length": 2}),
         ("ObservationNoise", {"std": 0.2}),
     ],
