@@ -29,9 +29,10 @@ from beliefgym.wrappers.task import Task
 Array = NDArray[np.float64]
 LEARNED = ("psim", "psim-actions", "psim-hints", "imf")
 KNOWN = ("particle", "ukf", "ekf")  # know the system; a ceiling
-LEAST_NOISE = (
-    0.01  # standard deviation of sensors that have none, in the units of the observation: a filter needs some
-)
+# standard deviation of sensors that have none, in the units of the observation: a filter needs some, and below that of
+# particles too few are near enough to the first observation
+LEAST_NOISE, LEAST_NOISE_OF_PARTICLES = 0.01, 0.05
+PARTICLE_MARGIN = 1.3  # and a little more than the sensors have, or some clouds lose the state
 
 
 def new_filter(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> Filter:
@@ -49,7 +50,7 @@ def new_filter(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> 
     if name not in LEARNED:
         raise ValueError(f"expected filter to be one of {', '.join((*LEARNED, *KNOWN))}, got {name!r}")
     chosen: dict[str, Any] = {
-        "n_future": 5,
+        "n_future": 5 if name == "psim-hints" else 10,
         "n_iterations": 30,
         "discount": 0.8,
         "n_frequencies": 300,
@@ -112,13 +113,16 @@ def _known(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> Filt
 
     env = task.make_vec(1)
     system, names = getattr(env.unwrapped, "system", None), component_names(env)
-    noise = [layer.transform._std for layer in layers(env) if isinstance(_transform(layer), AddNoise)]  # type: ignore[union-attr]
+    noise = [layer.transform for layer in layers(env) if isinstance(_transform(layer), AddNoise)]  # type: ignore[union-attr]
     env.close()
     if system is None:
         raise ValueError(
             f"expected a task of a beliefgym system for the filter {name!r}, which knows its dynamics, got {task.label}"
         )
-    std = np.maximum(np.sqrt(np.sum(np.square(noise), axis=0)) if noise else 0.0, LEAST_NOISE)
+    least = LEAST_NOISE_OF_PARTICLES if name == "particle" else LEAST_NOISE
+    std = np.maximum(np.sqrt(sum(np.square(one.std) for one in noise)), least)
+    if name == "particle":
+        std = PARTICLE_MARGIN * std
     kinds: dict[str, Callable[..., Filter]] = {
         "particle": ParticleFilter,
         "ukf": UnscentedKalmanFilter,
@@ -130,7 +134,9 @@ def _known(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> Filt
         "observation_noise_std": tuple(np.broadcast_to(std, len(names)).tolist()),
     }
     if name == "particle":
-        settings |= {"n_particles": 500, "roughening": 0.2, "random_state": seed}
+        settings |= {"n_particles": 1000, "roughening": 0.3, "random_state": seed}
+        if noise and noise[0].clips:
+            settings["clipped_to"] = noise[0].observation_space.low, noise[0].observation_space.high
     return kinds[name](**{**settings, **options})
 
 

@@ -25,7 +25,11 @@ STREAM_STRIDE = 1 << 16
 
 
 class AddNoise(ObservationTransform):
-    """y = x + std eps, batched; see `ObservationNoise`."""
+    """y = x + std eps, batched; see `ObservationNoise`.
+
+    Attributes:
+        std: (n_obs,) in the components' units. clips: whether y is kept within the observation space.
+    """
 
     def __init__(self, below: Interface, std: Std, clip: bool) -> None:
         space = below.observation_space
@@ -34,9 +38,9 @@ class AddNoise(ObservationTransform):
                 f"noise needs an observation of floating-point numbers, got {space.dtype}; "
                 "put gymnasium.wrappers.DtypeObservation(env, numpy.float32) around the environment first"
             )
-        self._std = _checked_std(std, below.observation_names)
-        self._clip = clip
-        noisy = (self._std > 0) & (not clip)
+        self.std = _checked_std(std, below.observation_names)
+        self.clips = clip
+        noisy = (self.std > 0) & (not clip)
         low, high = np.where(noisy, -np.inf, space.low), np.where(noisy, np.inf, space.high)
         super().__init__(
             Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type),
@@ -58,9 +62,9 @@ class AddNoise(ObservationTransform):
         return self._add(observations, mask)
 
     def _add(self, observations: NDArray[Any], mask: Mask) -> NDArray[Any]:
-        noise = self._std * self._streams.normal(len(self._std), mask)
+        noise = self.std * self._streams.normal(len(self.std), mask)
         noisy = (observations + noise).astype(observations.dtype, copy=False)
-        if self._clip:
+        if self.clips:
             np.clip(noisy, self.observation_space.low, self.observation_space.high, out=noisy)
         return noisy
 

@@ -7,6 +7,9 @@ weights by systematic resampling: with one u uniform in 0..1, particle i is take
 n_particles fall into its part of the cumulated weights. What is missing of x does not weigh. Weights are kept as
 logarithms, so that an observation however unlikely leaves the nearest particles, not none.
 
+Where sensors are clipped to limits, an observation at one tells no more than that the sensor was there or beyond: its
+weight is the probability of that, Phi((h_j(s) - high_j) / sqrt R_j) or Phi((low_j - h_j(s)) / sqrt R_j).
+
 It is right for any belief, also of several peaks, as the number of particles grows. A component of the state that has
 no noise, such as an unknown mass, keeps only the values drawn at the start; `roughening` moves them.
 
@@ -23,6 +26,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import log_ndtr
 
 from beliefgym.envs.estimators.physics_filter import PhysicsFilter, StateEstimate
 from beliefgym.envs.estimators.physics_setup import Parameters
@@ -49,6 +53,8 @@ class ParticleFilter(PhysicsFilter):
         resample_below: share of n_particles, in 0..1; 0 never resamples, 1 does at every step.
         roughening: K of Gordon et al.: each resampled particle moves by a normal number of standard deviation
             K E n_particles^(-1/n_state), E the range of the component over the particles before. 0 for none.
+        clipped_to: (low, high) that the observations, noise and all, are clipped to, each one number or (n_obs,); None
+            where they are not.
         random_state: seed or generator; of a generator a copy is used. None is different every time.
 
     Example:
@@ -69,6 +75,7 @@ class ParticleFilter(PhysicsFilter):
         n_particles: int = 1000,
         resample_below: float = 0.5,
         roughening: float = 0.0,
+        clipped_to: tuple[ArrayLike, ArrayLike] | None = None,
         random_state: int | np.random.Generator | None = 0,
     ) -> None:
         super().__init__(
@@ -81,6 +88,7 @@ class ParticleFilter(PhysicsFilter):
         self.n_particles = n_particles
         self.resample_below = resample_below
         self.roughening = roughening
+        self.clipped_to = clipped_to
         self.random_state = random_state
 
     @property
@@ -132,10 +140,24 @@ class ParticleFilter(PhysicsFilter):
             return belief
         states, log_weights = self._split(belief)
         with np.errstate(over="ignore", invalid="ignore"):
-            error = np.where(present[:, None], z[:, None] - self._sensed(states), 0.0)
-            likelihood = -0.5 * (np.square(error) / self._set.noise_variance).sum(axis=2)
+            sensed = self._sensed(states)
+            error = np.where(present[:, None], z[:, None] - sensed, 0.0)
+            each = -0.5 * np.square(error) / self._set.noise_variance
+            if self.clipped_to is not None:
+                self._weigh_limits(each, sensed, z)
+            likelihood = each.sum(axis=2)
             following = log_weights + np.where(np.isnan(likelihood), -np.inf, likelihood)
         return self._joined(states, self._normalised(following), 1.0)
+
+    def _weigh_limits(self, each: Array, sensed: Array, z: Array) -> None:
+        """Put the log-probability of a limit, over the density's factor, where an observation is at one; in place."""
+        assert self.clipped_to is not None
+        std = np.sqrt(self._set.noise_variance)
+        for limit, sign in zip(self.clipped_to, (-1.0, 1.0), strict=True):
+            at = np.broadcast_to(np.asarray(limit, dtype=np.float64), z.shape[1:])
+            row, component = np.nonzero(z >= at if sign > 0 else z <= at)
+            beyond = sign * (sensed[row, :, component] - at[component, None]) / std[component, None]
+            each[row, :, component] = log_ndtr(beyond)
 
     def _expect(self, belief: Array) -> Array:
         states, log_weights = self._split(belief)
@@ -218,6 +240,14 @@ class ParticleFilter(PhysicsFilter):
             raise ValueError(f"expected resample_below in 0..1, got {self.resample_below!r}")
         if not 0 <= self.roughening < np.inf:
             raise ValueError(f"expected roughening finite and at least 0, got {self.roughening!r}")
+        if self.clipped_to is not None:
+            low, high = (np.asarray(limit, dtype=np.float64) for limit in self.clipped_to)
+            n_obs = len(setting.observed)
+            if low.shape not in ((), (n_obs,)) or high.shape not in ((), (n_obs,)) or not (low < high).all():
+                raise ValueError(
+                    f"expected clipped_to as (low, high), each one number or {n_obs}, low below high, got "
+                    f"{self.clipped_to!r}"
+                )
         self._told_impossible = False
         return setting
 

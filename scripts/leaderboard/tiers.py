@@ -19,14 +19,9 @@ from beliefgym.wrappers.task import Task
 
 POSITION_ONLY = ("beliefgym/PendulumPosition-v0", "beliefgym/CartPoleSwingUpPosition-v0")
 REFERENCES = {"random": 0, "expert": 0}  # agents that do not train
-BELIEF_PENDULUMS = (
-    POSITION_ONLY[0],
-    *(f"beliefgym/PendulumPositionNoisy{level}-v0" for level in ("Easy", "Medium", "Hard")),
-)
-OF_SAC, OF_PPO = (
-    tuple(f"{algorithm}{sees}" for sees in ("-psim-hints", "-psim-actions", "-psim", "-stack", ""))
-    for algorithm in ("sac", "ppo")
-)
+NOISY = tuple(f"beliefgym/PendulumPositionNoisy{level}-v0" for level in ("Easy", "Medium", "Hard"))
+BELIEFS = ("sac-psim-hints", "sac-psim-actions")
+OF_PPO = tuple(f"ppo-{filter}" for filter in ("psim", "psim-actions", "psim-hints", "known"))
 RUNNER = "beliefgym.scripts.run_cell:run_cell"
 
 TIERS: dict[str, dict[str, Any]] = {
@@ -62,20 +57,36 @@ TIERS: dict[str, dict[str, Any]] = {
         "time_limit_s": 3600,
     },
     "belief-pendulum": {
-        "description": "Position-only pendulums, exact and with the suites' noise: SAC on the last observation, on four, "
-        "on learned beliefs and on the belief of a filter that knows the system, at equal steps (those that filters are "
-        "fitted to among them); recurrent PPO and full sight beside.",
-        "tasks": BELIEF_PENDULUMS,
-        "steps": {**REFERENCES, **dict.fromkeys(("recurrent-ppo", "sac-known", *OF_SAC), 20_000)},
+        "description": "The pendulum by its position: SAC on learned beliefs, on four observations and on full sight, and "
+        "recurrent PPO, at equal steps (those that filters are fitted to among them).",
+        "tasks": POSITION_ONLY[:1],
+        "steps": {**REFERENCES, **dict.fromkeys((*BELIEFS, "sac-stack", "recurrent-ppo"), 20_000)},
         "also": (("beliefgym/Pendulum-v0", {**REFERENCES, "sac": 20_000}),),
         "seeds": 10,
         "eval_episodes": 300,
         "time_limit_s": 1800,
     },
-    "belief-ppo": {
-        "description": "The same with PPO, on an exact and a noisy pendulum.",
-        "tasks": BELIEF_PENDULUMS[:3:2],
-        "steps": {**REFERENCES, **dict.fromkeys(("ppo-known", *OF_PPO), 100_000)},
+    "belief-noisy": {
+        "description": "The same under the noise of the suites of hidden-state tasks, with the belief of a particle filter "
+        "that knows the system for a ceiling.",
+        "tasks": NOISY,
+        "steps": {
+            **REFERENCES,
+            **dict.fromkeys((*BELIEFS, "sac-stack", "recurrent-ppo", "sac-known"), 20_000),
+        },
+        "seeds": 5,
+        "eval_episodes": 300,
+        "time_limit_s": 1800,
+    },
+    "belief-more": {
+        "description": "What is left of SAC and PPO on the last observation, four of them, and every belief, on the exact "
+        "and on a noisy pendulum.",
+        "tasks": (POSITION_ONLY[0], NOISY[1]),
+        "steps": {
+            **REFERENCES,
+            **dict.fromkeys(("sac", "sac-psim", "sac-known"), 20_000),
+            **dict.fromkeys(("ppo", "ppo-stack", *OF_PPO), 100_000),
+        },
         "seeds": 3,
         "eval_episodes": 300,
         "time_limit_s": 1800,
