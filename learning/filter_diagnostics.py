@@ -92,7 +92,7 @@ class ErrorCurves:
 def filter_jacobian(filter: Filter, belief: ArrayLike, observation: ArrayLike) -> Array:
     """J = dF / dm at each row: the matrix itself where it is constant, else by central differences in one batch.
 
-    Of F without the bounds that beliefs are kept in. The step that a `ForwardPSIM` counts in its belief is no
+    Of F without the bounds that beliefs are kept in, and of a filter with actions at the average one. The step that a `ForwardPSIM` counts in its belief is no
     coordinate of the state, and left out.
 
     Args:
@@ -275,7 +275,8 @@ def _jacobian(filter: Filter, belief: Array, z: Array) -> Array:
     down[:, component, component] -= step
     width = up[:, component, component] - down[:, component, component]  # as rounded
     both = np.concatenate([up, down]).reshape(2 * n * size, -1)
-    following = filter._update(both, np.tile(np.repeat(z, size, axis=0), (2, 1)))[:, :size]
+    inputs = np.tile(np.repeat(filter._with_actions(z, None), size, axis=0), (2, 1))
+    following = filter._update(both, inputs)[:, :size]
     above, below = following.reshape(2, n, size, size)
     return np.swapaxes((above - below) / width[:, :, None], 1, 2)
 

@@ -72,7 +72,7 @@ class FirstMoments(FutureFeatures):
 
     def __call__(self, futures: Array) -> Array:
         """See the base."""
-        return futures.reshape(len(futures), -1)
+        return futures.reshape(len(futures), self.n_future * self.n_obs)
 
     def read(self, state: Array) -> Array:
         """The first k n_obs features."""

@@ -210,7 +210,7 @@ class PSIMActions(PSIM):
         if not self.per_decision:
             logs = logs[:, :, -1:]
         complete = np.arange(n_rows) < data.n_targets[:, None]
-        weights = np.zeros(logs.shape)
+        weights: Array = np.zeros(logs.shape)
         for i in range(logs.shape[2]):
             weights[complete, i] = normalised_weights(logs[complete, i], self.truncate)
         shares = [effective_sample_share(weights[complete, i]) for i in range(weights.shape[2])]
@@ -288,7 +288,8 @@ class PSIMActions(PSIM):
         if not (counts > 2).any():
             raise ValueError(
                 f"expected a trajectory of at least n_future + 2 = {self.n_future + 2} observations with "
-                f"state='joint', got {len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower n_future"
+                f"state='joint', got {len(sequences)} of at most {sequences.lengths.max(initial=-1) + 1}; lower "
+                "n_future"
             )
         return np.maximum(counts - 1, 0)
 

@@ -112,6 +112,8 @@ class BackpropPSIM(PredictiveStateFilter):
         """
         self._check_parameters()
         psim = clone(PSIM() if self.psim is None else self.psim)
+        if type(psim) is not PSIM:
+            raise TypeError(f"expected psim as a PSIM, without actions or hints, got {type(psim).__name__}")
         self.psim_ = psim.fit(train, validation) if self.init == "dagger" else None
         self.n_future, self.features, self.target = psim.n_future, psim.features, psim.target
         self.standardise, self.belief_limit = psim.standardise, psim.belief_limit

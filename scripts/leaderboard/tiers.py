@@ -57,8 +57,8 @@ TIERS: dict[str, dict[str, Any]] = {
         "time_limit_s": 3600,
     },
     "belief-pendulum": {
-        "description": "The pendulum by its position: SAC on learned beliefs, on four observations and on full sight, and "
-        "recurrent PPO, at equal steps (those that filters are fitted to among them).",
+        "description": "The pendulum by its position: SAC on learned beliefs, on four observations and on full sight, "
+        "and recurrent PPO, at equal steps (those that filters are fitted to among them).",
         "tasks": POSITION_ONLY[:1],
         "steps": {**REFERENCES, **dict.fromkeys((*BELIEFS, "sac-stack", "recurrent-ppo"), 20_000)},
         "also": (("beliefgym/Pendulum-v0", {**REFERENCES, "sac": 20_000}),),
@@ -67,8 +67,8 @@ TIERS: dict[str, dict[str, Any]] = {
         "time_limit_s": 1800,
     },
     "belief-noisy": {
-        "description": "The same under the noise of the suites of hidden-state tasks, with the belief of a particle filter "
-        "that knows the system for a ceiling.",
+        "description": "The same under the noise of the suites of hidden-state tasks, with the belief of a particle "
+        "filter that knows the system for a ceiling.",
         "tasks": NOISY,
         "steps": {
             **REFERENCES,
@@ -79,8 +79,8 @@ TIERS: dict[str, dict[str, Any]] = {
         "time_limit_s": 1800,
     },
     "belief-more": {
-        "description": "What is left of SAC and PPO on the last observation, four of them, and every belief, on the exact "
-        "and on a noisy pendulum.",
+        "description": "What is left of SAC and PPO on the last observation, four of them, and every belief, on the "
+        "exact and on a noisy pendulum.",
         "tasks": (POSITION_ONLY[0], NOISY[1]),
         "steps": {
             **REFERENCES,

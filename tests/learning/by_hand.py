@@ -48,3 +48,14 @@ def eigenvalue_error(found, true):
     """The largest distance from a true eigenvalue to the nearest found one."""
     found, true = np.linalg.eigvals(found), np.linalg.eigvals(true)
     return np.abs(found[:, None] - true).min(axis=0).max()
+
+
+def weighted_ridge(X, Y, W, alpha):
+    """Scikit-learn's ridge, penalty a sample, on each target column with its own weights W (n, d): a function, A, b."""
+    X, Y, W = (np.array(one) for one in (X, Y, W))
+    fits = [
+        ScikitRidge(alpha=alpha * w.sum(), solver="svd").fit(X, y, sample_weight=w)
+        for y, w in zip(Y.T, W.T, strict=True)
+    ]
+    A, b = np.array([f.coef_ for f in fits]), np.array([f.intercept_ for f in fits])
+    return lambda z: A @ z + b, A, b

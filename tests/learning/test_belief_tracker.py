@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from beliefgym.learning import (
     RandomFourierRidge,
     Ridge,
     Sequences,
+    ridge_step,
 )
 from beliefgym.learning.belief_tracker import shown
 from beliefgym.learning.filters import Filter
@@ -58,6 +60,7 @@ def recorded(n_episodes: int, seed: int, short: bool, n_steps: int = 30) -> Sequ
 
 
 TRAIN, TEST = recorded(60, 0, short=False), recorded(9, 1, short=True)
+WAVES = RandomFourierRidge(n_frequencies=20, include_inputs=True, random_state=0)
 QUICK = {
     "PSIM": PSIM(n_iterations=2),
     "PSIM, delta": PSIM(n_iterations=2, target="delta"),
@@ -68,12 +71,17 @@ QUICK = {
     "PSIMActions": PSIMActions(n_iterations=2),
     "ConditionalPSIM": ConditionalPSIM(n_iterations=2),
     "PSIMActions, joint": PSIMActions(n_iterations=2, state="joint"),
+    "PSIM, random features": PSIM(WAVES, n_iterations=2),
+    "PSIM, random features alone, delta": PSIM(
+        RandomFourierRidge(n_frequencies=20, random_state=0), n_iterations=2, target="delta"
+    ),
+    "PSIMHints, random features, previous action": PSIMHints(
+        WAVES, n_iterations=2, preimage="belief", use_actions=True
+    ),
+    "PSIMActions, random features": PSIMActions(WAVES, n_iterations=2),
 }
 FILTERS: dict[str, Filter] = {
     **QUICK,
-    "PSIM, random features": PSIM(
-        RandomFourierRidge(n_frequencies=20, include_inputs=True, random_state=0), n_iterations=2
-    ),
     "PSIM, second moments, delta": PSIM(n_iterations=2, features="second", target="delta"),
     "PSIMHints, choices": PSIMHints(n_iterations=2, preimage="belief", use_actions=True, n_choices=4),
     "PSIMActions, choices": PSIMActions(n_iterations=2, n_choices=4),
@@ -204,6 +212,41 @@ def test_one_matrix_product_is_the_filters_own_update(name):
     slow._quick = None
     np.testing.assert_allclose(online(quick, TEST), online(slow, TEST), rtol=EXACT, atol=EXACT)
     np.testing.assert_allclose(quick.belief, slow.belief, rtol=EXACT, atol=EXACT)
+
+
+@pytest.mark.parametrize("cached", [1, 20 * 4, 20 * 9])
+def test_random_features_go_in_blocks(monkeypatch, cached):
+    """Of one belief, of four with one left over, of all at once."""
+    monkeypatch.setattr(ridge_step, "CACHED", cached)
+    filter = FILTERS["PSIMActions, random features"]
+    expected, mask = filter.summaries(TEST), TEST.observation_mask
+    found = online(BeliefTracker(filter, len(TEST)), TEST)
+    np.testing.assert_allclose(found[mask], expected[mask], rtol=EXACT, atol=EXACT)
+
+
+@pytest.mark.parametrize("name", ["PSIM", "PSIM, random features", "PSIMActions", "GRUFilter"])
+def test_it_writes_where_it_is_told(name):
+    """The same numbers, rounded to the precision there; rows outside the mask stay."""
+    one, other = (BeliefTracker(FILTERS[name], len(TEST)) for _ in range(2))
+    room = np.full((len(TEST), 1 + one.size), 7.0, np.float32)
+    out, mask = room[:, 1:], np.arange(len(TEST)) % 2 == 0
+    x, a = TEST.observations, TEST.actions
+    assert one.begin(x[:, 0], out=out) is out
+    np.testing.assert_array_equal(out, other.begin(x[:, 0]).astype(np.float32))
+    before = out.copy()
+    assert one.go_on(x[:, 1], a[:, 0], mask, out) is out
+    expected = other.go_on(x[:, 1], a[:, 0], mask).astype(np.float32)
+    np.testing.assert_array_equal(out, np.where(mask[:, None], expected, before))
+    np.testing.assert_array_equal(room[:, 0], 7.0)
+
+
+def test_what_single_precision_cannot_show_is_told():
+    """Where the scale of what is shown is so small that a belief within its bounds is past all bounds."""
+    filter = PSIM(n_iterations=1).fit(TRAIN)
+    filter.belief_scale_ = replace(filter.belief_scale_, scale=filter.belief_scale_.scale * 1e-38)
+    tracker = BeliefTracker(filter, len(TEST))
+    with pytest.raises(FloatingPointError, match="has diverged"):
+        tracker.begin(TEST.observations[:, 0], out=np.zeros((len(TEST), tracker.size), np.float32))
 
 
 @pytest.mark.parametrize("name", QUICK)
