@@ -33,6 +33,7 @@ REPRODUCTIONS = {
     "hints-pendulum": "beliefgym.scripts.reproductions.hints_tables:pendulum",
     "hints-attitude": "beliefgym.scripts.reproductions.hints_tables:attitude",
     "hints-mass": "beliefgym.scripts.reproductions.hints_tables:mass",
+    "actions-interventions": "beliefgym.scripts.reproductions.actions_interventions:run",
 }
 
 

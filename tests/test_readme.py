@@ -173,3 +173,24 @@ def test_the_guide_to_hints_runs():
     assert (
         abs(np.sin(names["angle_and_speed"][0, 0]) - 0.2) < 0.02
     )  # what was seen of it, nearly without noise
+
+
+@in_checkout
+def test_the_guide_to_actions_runs():
+    """Every block in turn: forecasts differ by the torque, weights have effective samples."""
+    blocks = blocks_of(README.parent / "docs" / "filters-with-actions.md")
+    assert len(blocks) == 3
+    names: dict = {}
+    exec(blocks[0], names)
+    futures = names["futures"]
+    assert futures.shape == (5, 10, 2)
+    angles = np.unwrap(np.arctan2(futures[:, :, 1], futures[:, :, 0]), axis=1)
+    turned = angles[:, -1] - angles[:, 0]
+    assert (np.diff(turned) > 0.1).all()  # 1 N m for half a second is a third of a radian, by hand
+    assert names["filter"].errors(names["test"]).mean < 0.01
+    exec(blocks[1], names)
+    samples = names["weighed"].effective_samples_
+    assert samples[0] == 1.0 > samples[1] > samples[2] > 0.01
+    exec(blocks[2], names)
+    forecast = names["conditional"].forecast(names["belief"], 10, names["test"].actions[:, 20:])
+    assert np.sqrt(np.square(forecast[:, :5] - names["test"].observations[:, 20:25]).mean()) < 0.3
