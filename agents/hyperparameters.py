@@ -38,7 +38,7 @@ _PPO_PENDULUM = {
 }
 
 # one setting for every environment with several continuous actions, chosen before any of them was run
-_PPO_CONTROL = {
+_PPO_CONTROL: dict[str, Any] = {
     "n_envs": 16,
     "normalize": True,
     "rescale_actions": True,
@@ -52,6 +52,8 @@ _PPO_CONTROL = {
         "learning_rate": "linear:1e-3",
     },
 }
+# recurrent PPO has the same setting there
+_RECURRENT_CONTROL = {**_PPO_CONTROL, "arguments": {**_PPO_CONTROL["arguments"], **_RECURRENT}}
 _CONTROL = (
     *("Helicopter", "Quadrotor", "MobileBase", "Baxter", "Mico", "DoublePendulum"),
     *("Hopper", "Walker2d", "HalfCheetah", "Swimmer", "InvertedPendulum"),
@@ -121,6 +123,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
                 **_PPO_PENDULUM,
             },
         },
+        **dict.fromkeys(_CONTROL, _RECURRENT_CONTROL),
         "CartPoleSwingUp": {
             "n_envs": 8,
             "normalize": True,

@@ -26,8 +26,8 @@ class Leaderboard:
 
     tier: str = "standard"
     """smoke (a minute), standard (a quarter of an hour on 2 cores), full (an hour and a half), difficulty (an agent
-    without memory on every environment; an hour), or belief-pendulum, belief-noisy and belief-more (agents on beliefs;
-    an hour each)."""
+    without memory on every environment; an hour), or belief-pendulum, belief-noisy, belief-more and belief-tasks
+    (agents on beliefs; an hour each, the last two)."""
     name: str = ""
     """Name of a leaderboard of your own, with --envs, --agents, --steps and --seeds in place of a tier's."""
     envs: tuple[str, ...] = ()

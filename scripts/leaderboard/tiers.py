@@ -91,6 +91,24 @@ TIERS: dict[str, dict[str, Any]] = {
         "eval_episodes": 300,
         "time_limit_s": 1800,
     },
+    "belief-tasks": {
+        "description": "Five more partially observed tasks, of which helicopter and quadrotor have noisy sensors: PPO "
+        "on learned beliefs and on four observations, and recurrent PPO, at equal steps.",
+        "tasks": (
+            "beliefgym/CartPoleSwingUpPosition-v0",
+            Task("beliefgym/HelicopterHoverNoisy-v0", {}, (("ObservationDelay", {"steps": 1}),)),
+            "beliefgym/BaxterReachPosition-v0",
+            "beliefgym/QuadrotorHoverIMUPositionNoisy-v0",
+            "beliefgym/HopperPosition-v0",
+        ),
+        "steps": {
+            **REFERENCES,
+            **dict.fromkeys(("ppo-psim-hints", "ppo-psim-actions", "ppo-stack", "recurrent-ppo"), 100_000),
+        },
+        "seeds": 5,
+        "eval_episodes": 100,
+        "time_limit_s": 3600,
+    },
     "difficulty": {
         "description": "Every environment and an agent without memory: what hiding a part of the state costs it.",
         "tasks": tuple(registered_ids()),
@@ -114,7 +132,8 @@ def tier(name: str) -> Grid:
         raise LeaderboardError(f"there is no tier {name!r}{hint} (known: {', '.join(TIERS)})")
     plan = TIERS[name]
     seeds, episodes = range(plan["seeds"]), plan["eval_episodes"]
-    cells = build_cells([Task(env_id) for env_id in plan["tasks"]], plan["steps"], seeds, episodes)
+    tasks = [task if isinstance(task, Task) else Task(task) for task in plan["tasks"]]
+    cells = build_cells(tasks, plan["steps"], seeds, episodes)
     for env_id, steps in plan.get("also", ()):  # what only one task has
         cells += build_cells([Task(env_id)], steps, seeds, episodes)
     return Grid(name, cells, time_limit_s=plan["time_limit_s"], description=plan["description"])
