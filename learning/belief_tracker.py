@@ -155,14 +155,18 @@ class BeliefTracker:
             self.go_on(sequences.observations[:, t], sequences.actions[:, t - 1], sequences.lengths >= t)
         return self._shown(ALL)
 
-    def _take(self, x: Array, actions: Array | None, rows: Rows) -> None:
+    def _take(self, x: NDArray[Any], actions: NDArray[Any] | None, rows: Rows) -> None:
         """m <- F(m, x, a) in these rows, whose observations and actions are given."""
         if not len(x):
             return
         belief, filter = self._belief[rows], self.filter
-        following = None if self._quick is None else self._quick(belief, x, actions)
-        if following is None:
-            following = filter._follow(belief, filter._scale.apply(x.astype(np.float64, copy=False)), actions)
+        if self._quick is not None:
+            following = self._quick(belief, x, actions)
+            if not np.abs(following).max() <= self._quick.least_bound:  # NaN is not
+                following = filter._within_bounds(following, belief)
+        else:
+            z = filter._scale.apply(x.astype(np.float64, copy=False))
+            following = filter._follow(belief, z, actions)
             self._check_size(following, rows)
         self._belief[rows] = following
 

@@ -298,7 +298,10 @@ class Filter(BaseEstimator, ABC):
 
     def _advance(self, belief: Array, z: Array) -> Array:
         """`_update` within the bounds."""
-        following = self._update(belief, z)
+        return self._within_bounds(self._update(belief, z), belief)
+
+    def _within_bounds(self, following: Array, belief: Array) -> Array:
+        """What follows a belief, kept inside +-_bound; what is NaN stays as it was."""
         bound = self._bound
         if bound is None or bool((np.abs(following) <= bound).all()):
             return following
@@ -311,7 +314,7 @@ class Filter(BaseEstimator, ABC):
                 f"{following[row, component]:g} in standardised units, bound {bound[component]:g}) and is kept inside; "
                 "this is told once. Observations unlike the training data, or an unstable filter, do that",
                 DivergenceWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         following = np.where(np.isnan(following), belief, following)
         return np.clip(following, -bound, bound)

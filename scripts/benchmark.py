@@ -20,6 +20,7 @@ BENCHMARKS = {
     "control": "beliefgym.scripts.benchmarks.control:run",
     "filter": "beliefgym.scripts.benchmarks.filter:run",
     "hints": "beliefgym.scripts.benchmarks.hints:run",
+    "belief": "beliefgym.scripts.benchmarks.belief:run",
 }
 
 
@@ -33,7 +34,7 @@ class Benchmark:
     """
 
     name: tyro.conf.Positional[str]
-    """Which: env, dad, control, filter, hints."""
+    """Which: env, dad, control, filter, hints, belief."""
     results: Path = Path("results")
     """Folder; NAME.json and NAME.md are written to its benchmark/."""
 

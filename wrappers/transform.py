@@ -252,8 +252,8 @@ class VectorTransformObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         final_observations = np.full(self.num_envs, None, dtype=object)
         for row, observation in zip(rows, going_on[rows], strict=True):
             final_observations[row] = observation
-        begun = self.transform.reset(observations, ended)
-        return np.where(ended[:, None], begun, going_on), {**infos, "final_obs": final_observations}
+        going_on[rows] = self.transform.reset(observations, ended)[rows]
+        return going_on, {**infos, "final_obs": final_observations}
 
     def _show(self, changed: NDArray[Any]) -> NDArray[Any]:
         self._shown = changed.copy()  # the caller may write into what he gets

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -224,33 +223,8 @@ def test_random_features_go_in_blocks(monkeypatch, cached):
     np.testing.assert_allclose(found[mask], expected[mask], rtol=EXACT, atol=EXACT)
 
 
-@pytest.mark.parametrize("name", ["PSIM", "PSIM, random features", "PSIMActions", "GRUFilter"])
-def test_it_writes_where_it_is_told(name):
-    """The same numbers, rounded to the precision there; rows outside the mask stay."""
-    one, other = (BeliefTracker(FILTERS[name], len(TEST)) for _ in range(2))
-    room = np.full((len(TEST), 1 + one.size), 7.0, np.float32)
-    out, mask = room[:, 1:], np.arange(len(TEST)) % 2 == 0
-    x, a = TEST.observations, TEST.actions
-    assert one.begin(x[:, 0], out=out) is out
-    np.testing.assert_array_equal(out, other.begin(x[:, 0]).astype(np.float32))
-    before = out.copy()
-    assert one.go_on(x[:, 1], a[:, 0], mask, out) is out
-    expected = other.go_on(x[:, 1], a[:, 0], mask).astype(np.float32)
-    np.testing.assert_array_equal(out, np.where(mask[:, None], expected, before))
-    np.testing.assert_array_equal(room[:, 0], 7.0)
-
-
-def test_what_single_precision_cannot_show_is_told():
-    """Where the scale of what is shown is so small that a belief within its bounds is past all bounds."""
-    filter = PSIM(n_iterations=1).fit(TRAIN)
-    filter.belief_scale_ = replace(filter.belief_scale_, scale=filter.belief_scale_.scale * 1e-38)
-    tracker = BeliefTracker(filter, len(TEST))
-    with pytest.raises(FloatingPointError, match="has diverged"):
-        tracker.begin(TEST.observations[:, 0], out=np.zeros((len(TEST), tracker.size), np.float32))
-
-
 @pytest.mark.parametrize("name", QUICK)
-def test_beyond_the_bounds_the_filter_itself_is_asked(name):
+def test_beyond_the_bounds_it_is_kept_inside_as_the_filter_keeps_it(name):
     """Beliefs are kept inside and it is told once, by every tracker; the filter does not notice."""
     filter = FILTERS[name]
     before = pickle.dumps(filter)
