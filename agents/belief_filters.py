@@ -6,7 +6,10 @@ first, weak hypotheses met, which brings the error of the estimated velocity dow
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,9 @@ from beliefgym.learning import (
     PSIMActions,
     PSIMHints,
     RandomFourierRidge,
+    Sequences,
+    load_filter,
+    save_filter,
 )
 from beliefgym.wrappers.components import component_names, layers
 from beliefgym.wrappers.observation_noise import AddNoise
@@ -28,7 +34,9 @@ from beliefgym.wrappers.task import Task
 
 Array = NDArray[np.float64]
 LEARNED = ("psim", "psim-actions", "psim-hints", "imf")
+TRAINED_BY_HINTS = LEARNED[2:]
 KNOWN = ("particle", "ukf", "ekf")  # know the system; a ceiling
+VALIDATION_SHARE = 0.2  # of recorded episodes, to choose among a filter's hypotheses
 # standard deviation of sensors that have none, in the units of the observation: a filter needs some, and below that of
 # particles too few are near enough to the first observation
 LEAST_NOISE, LEAST_NOISE_OF_PARTICLES = 0.01, 0.05
@@ -50,12 +58,12 @@ def new_filter(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> 
     if name not in LEARNED:
         raise ValueError(f"expected filter to be one of {', '.join((*LEARNED, *KNOWN))}, got {name!r}")
     chosen: dict[str, Any] = {
-        "n_future": 5 if name == "psim-hints" else 10,
+        "n_future": 5,
         "n_iterations": 30,
         "discount": 0.8,
         "n_frequencies": 300,
         "bandwidth": None,
-        "alpha": 1e-5,
+        "alpha": 1e-5 if name in ("psim-hints", "imf") else 1e-6,
         **options,
     }
     regressor = RandomFourierRidge(
@@ -73,7 +81,56 @@ def new_filter(name: str, task: Task, seed: int, options: Mapping[str, Any]) -> 
     chosen = {"use_actions": True, "preimage": "belief", **chosen}
     if name == "psim-hints":
         return PSIMHints(regressor, **chosen)
-    return InferenceMachineFilter(regressor, **{k: v for k, v in chosen.items() if k != "n_future"})
+    if "n_future" not in options:  # it has none, and says so where one is asked for
+        del chosen["n_future"]
+    return InferenceMachineFilter(regressor, **chosen)
+
+
+def usual_filter(task: Task, hinted: Task | None, name: str = "auto") -> str:
+    """The name itself, or "auto"'s choice for a task and what `task_with_hints` gave of it.
+
+    Raises:
+        ValueError: a filter that is trained by hints, for a task without.
+    """
+    if name in TRAINED_BY_HINTS and hinted is None:
+        raise ValueError(
+            f"expected a task that offers hints for the filter {name!r}, and {task.label} offers none; take "
+            "'psim-actions' or 'psim'"
+        )
+    return name if name != "auto" else "psim-actions" if hinted is None else "psim-hints"
+
+
+def filter_to_bytes(filter: Filter) -> bytes:
+    """The content of the file that `save_filter` writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        return save_filter(filter, Path(folder) / "filter.safetensors").read_bytes()
+
+
+def filter_from_bytes(content: bytes) -> Filter:
+    """The reverse of `filter_to_bytes`."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "filter.safetensors"
+        path.write_bytes(content)
+        return load_filter(path)
+
+
+def drawn_within(episodes: Sequences, n_steps: int, seed: Sequence[int]) -> Sequences:
+    """All episodes where they have no more than so many steps, else a random part of them, but one at least."""
+    if episodes.n_transitions <= n_steps:
+        return episodes
+    drawn = np.random.default_rng(seed).permutation(len(episodes))
+    count = np.count_nonzero(np.cumsum(episodes.lengths[drawn]) <= n_steps)
+    return episodes[np.sort(drawn[: max(1, count)])]
+
+
+def fit_with_validation(filter: Filter, episodes: Sequences, seed: Sequence[int]) -> None:
+    """Fit to a random part of the episodes, the rest for validation; a single one is all for fitting."""
+    count = max(1, round(VALIDATION_SHARE * len(episodes)))
+    held = np.random.default_rng(seed).permutation(len(episodes)) < count
+    train, validation = (episodes[~held], episodes[held]) if len(episodes) > 1 else (episodes, None)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*trajectories have fewer than.*")
+        filter.fit(train, validation)
 
 
 def task_with_hints(task: Task) -> Task | None:
@@ -86,17 +143,18 @@ def task_with_hints(task: Task) -> Task | None:
     return asked
 
 
-def hint_of(task: Task) -> tuple[Hint, tuple[str, ...] | None]:
+def hint_of(task: Task, raw: bool = False) -> tuple[Hint, tuple[str, ...] | None]:
     """What filters of this task are to estimate, made of its raw hints, and the names of the components.
 
     Of a system whose hint is the whole state that is its full observation: what the fully observed sibling shows, in
-    which angles are cosines and sines. Other hints are taken as they are.
+    which angles are cosines and sines. Other hints, and with `raw` all, are taken as they are.
     """
     env = task.make_vec(1)
     system = getattr(env.unwrapped, "system", None)
     env.close()
-    if system is None or system.hint_names:
-        return (lambda raw: raw), None if system is None else tuple(system.hint_names)
+    if system is None or system.hint_names or raw:
+        names = None if system is None else tuple(system.hint_names or system.state_names)
+        return (lambda hints: hints), names
     return system.observe, tuple(system.observation_names)
 
 

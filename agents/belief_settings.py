@@ -17,7 +17,7 @@ from beliefgym.learning.hint_filter import HintFilter
 
 CONTINUOUS = ("SAC", "TD3", "DDPG", "TQC", "CrossQ")
 LEAST = {
-    **dict.fromkeys(("explore_steps", "evaluation_episodes", "n_envs"), 1),
+    **dict.fromkeys(("explore_steps", "evaluation_episodes", "n_envs", "max_fit_steps"), 1),
     **dict.fromkeys(("refit_every", "n_refits", "evaluate_every"), 0),
 }
 
@@ -39,11 +39,13 @@ def check_algorithm(algorithm: str, space: Space[Any], rescale_actions: bool) ->
         raise ValueError(f"{algorithm} needs a bounded action space, got {space}")
 
 
-def check_counts(**counts: int | None) -> None:
-    """Raise ValueError unless each is a whole number, and not below `LEAST`; None stands for a usual number."""
+def check_schedule(refit_growth: float, **counts: int | None) -> None:
+    """Raise ValueError unless the growth is no decay, and each count whole and not below `LEAST`; None is usual."""
     for name, value in counts.items():
         if value is not None:
             check_whole(name, value, LEAST[name])
+    if not refit_growth >= 1:
+        raise ValueError(f"expected refit_growth of at least 1, got {refit_growth!r}")
 
 
 def check_show(show: str, filter: Filter) -> None:

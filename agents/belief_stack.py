@@ -15,12 +15,12 @@ from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from beliefgym.agents.sb3_agent import UnitActions
+from beliefgym.agents.sb3_models import normalizer_moments, set_normalizer_moments
 from beliefgym.agents.step_recorder import StepRecorder
 from beliefgym.learning import BeliefTracker, Filter
 from beliefgym.learning.belief_tracker import Show, shown
@@ -87,6 +87,15 @@ class BeliefStack:
             now, _ = self.seen_at_steps(recorder)
             self.normalizer.obs_rms.update(now.reshape(-1, now.shape[2]))
 
+    def moments(self) -> bytes | None:
+        """The moments of the normalisation, if there is one."""
+        return None if self.normalizer is None else normalizer_moments(self.normalizer)
+
+    def set_moments(self, moments: bytes | None) -> None:
+        """The reverse of `moments`."""
+        if self.normalizer is not None and moments is not None:
+            set_normalizer_moments(self.normalizer, moments)
+
     def take_over(self, model: BaseAlgorithm, recorder: StepRecorder, filter: Filter) -> None:
         """Show this filter everywhere: in the environment, in the replay buffer, in what the model sees next."""
         self._filter, n = filter, recorder.num_envs
@@ -141,16 +150,3 @@ class BeliefStack:
         if buffer.handle_timeout_termination:
             buffer.timeouts[places] = (steps.truncated & ~steps.terminated)[times]
         buffer.pos, buffer.full = n_steps % size, n_steps >= size
-
-
-def check_replay_buffer(model: BaseAlgorithm) -> None:
-    """Raise ValueError unless the model's replay buffer, if it has one, can be written anew."""
-    if not isinstance(model, OffPolicyAlgorithm):
-        return
-    buffer = model.replay_buffer
-    if type(buffer) is not ReplayBuffer or buffer.optimize_memory_usage:
-        kind = type(buffer).__name__ + (" with optimize_memory_usage" if type(buffer) is ReplayBuffer else "")
-        raise ValueError(
-            "expected SB3's plain ReplayBuffer, whose beliefs can be computed anew when the filter is refitted, got "
-            f"{kind}; leave n_steps, replay_buffer_class and optimize_memory_usage out of the arguments"
-        )

@@ -136,11 +136,14 @@ def _sb3(algorithm: str, **more: Any) -> Callable[[str], dict[str, Any]]:
 
 def _belief(algorithm: str, filter: str) -> Callable[[str], dict[str, Any]]:
     """The algorithm's usual options on beliefs, whatever they are without."""
-    return lambda env_id: {
-        **hyperparameters(algorithm, env_id),
-        "filter": filter,
-        **({} if filter in _LEARNED else {"filter": _known_filter(env_id)}),
-    }
+
+    def options(env_id: str) -> dict[str, Any]:
+        chosen = {**hyperparameters(algorithm, env_id), "filter": filter}
+        if filter not in _LEARNED:
+            return {**chosen, "filter": _known_filter(env_id)}
+        return chosen if filter == "psim-hints" else {**chosen, "filter_options": {"alpha": 1e-6}}
+
+    return options
 
 
 def _known_filter(env_id: str) -> str:

@@ -103,7 +103,12 @@ class StepRecorder(VectorWrapper[Any, Any, Any, Any, Any]):
         return len(self._steps.get("rewards", ()))
 
     def steps(self) -> Steps:
-        """All of them."""
+        """All of them.
+
+        Raises:
+            RuntimeError: there are none.
+        """
+        self._require_steps()
         return Steps(*(np.stack(self._steps[name]) for name in Steps._fields))
 
     def episodes(self, hint_of: Hint | None = None, **names: Any) -> tuple[Sequences, NDArray[np.int64]]:
@@ -115,7 +120,15 @@ class StepRecorder(VectorWrapper[Any, Any, Any, Any, Any]):
 
         Returns:
             The episodes, and (n_episodes, 2) the first step and the copy of each.
+
+        Raises:
+            RuntimeError: there are no steps. ValueError: hints are asked for and were not kept.
         """
+        self._require_steps()
+        if hint_of is not None and "hints" not in self._steps:
+            raise ValueError(
+                "expected a recorder with keeps_hints=True for episodes with hints, got one without"
+            )
         n_steps, n = self.n_recorded, self.num_envs
         ended = np.stack(self._steps["terminated"]) | np.stack(self._steps["truncated"])
         begins = np.zeros((n_steps + 1, n), dtype=np.bool_)
@@ -143,15 +156,20 @@ class StepRecorder(VectorWrapper[Any, Any, Any, Any, Any]):
         if hint_of is not None:
             raw = with_last("hints")
             flat = hint_of(raw.reshape(-1, raw.shape[2]).astype(np.float64))
-            arrays |= {"hints": flat.reshape(*raw.shape[:2], -1), "states": raw}
+            arrays["hints"] = flat.reshape(*raw.shape[:2], -1)
         terminated = np.stack(self._steps["terminated"])[stop - 1, copy]
         found = Sequences(**arrays, lengths=lengths, terminated=terminated, **names)
         return found, np.stack([start, copy], axis=1)
 
     def running(self) -> Sequences:
-        """What there is of the episode that each copy is in, one each; of length 0 where it has just begun."""
+        """What there is of the episode that each copy is in, one each; of length 0 where it has just begun.
+
+        Raises:
+            RuntimeError: nothing has begun.
+        """
         n_steps, n = self.n_recorded, self.num_envs
-        assert self._now is not None
+        if self._now is None:
+            raise RuntimeError("expected reset() before running()")
         begin = np.full(n, self._starts[-1])
         if n_steps:
             ended = np.stack(self._steps["terminated"]) | np.stack(self._steps["truncated"])
@@ -161,13 +179,18 @@ class StepRecorder(VectorWrapper[Any, Any, Any, Any, Any]):
         longest, rows = int(lengths.max()), np.arange(n)
         observations = np.zeros((n, longest + 1, self._now.shape[1]))
         n_act = self._steps["actions"][0].shape[1] if n_steps else 0
-        actions = np.zeros((n, longest, n_act))
+        actions, rewards = np.zeros((n, longest, n_act)), np.zeros((n, longest))
         if longest:
-            t = np.minimum(begin[:, None] + np.arange(longest), n_steps - 1)
-            observations[:, :-1] = np.stack(self._steps["observations"])[t, rows[:, None]]
-            actions[:] = np.stack(self._steps["actions"])[t, rows[:, None]]
+            index = np.minimum(begin[:, None] + np.arange(longest), n_steps - 1), rows[:, None]
+            observations[:, :-1] = np.stack(self._steps["observations"])[index]
+            actions[:] = np.stack(self._steps["actions"])[index]
+            rewards[:] = np.stack(self._steps["rewards"])[index]
         observations[rows, lengths] = self._now
-        return Sequences(observations, actions, np.zeros((n, longest)), lengths=lengths)
+        return Sequences(observations, actions, rewards, lengths=lengths)
+
+    def _require_steps(self) -> None:
+        if not self.n_recorded:
+            raise RuntimeError("expected at least one step() before what was recorded is asked for, got none")
 
     def _hints_of(self, infos: dict[str, Any]) -> NDArray[Any] | None:
         if not self._keeps_hints:

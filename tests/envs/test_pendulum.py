@@ -122,3 +122,66 @@ def test_impossible_parameters_are_told(parameters, message):
 def test_an_unknown_parameter_is_told_with_the_nearest():
     with pytest.raises(TypeError, match=r"no parameter 'dampin'; did you mean 'damping'"):
         gym.make("beliefgym/Pendulum-v0", dampin=0.3)
+
+
+LEVELS = {"Easy": (0.1, 200), "Medium": (0.2, 150), "Hard": (0.3, 100)}
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_noisy_siblings_have_the_suites_noise_clipped_to_the_circles_box(level):
+    """Around the true position; where it cannot reach the box's sides, its deviation is the suites'."""
+    std, n_steps = LEVELS[level]
+    n = 4000
+    noisy = gym.make_vec(
+        f"beliefgym/PendulumPositionNoisy{level}-v0", num_envs=n, vectorization_mode="vector_entry_point"
+    )
+    plain = gym.make("beliefgym/PendulumPosition-v0")
+    assert noisy.single_observation_space == plain.observation_space
+    assert noisy.spec.max_episode_steps == n_steps
+    observation, _ = noisy.reset(seed=0)
+    angle = noisy.unwrapped.state[:, 0]
+    true = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert np.abs(observation).max() <= 1.0
+    assert (np.abs(observation) == 1.0).any()
+    inside = np.abs(true) < 0.1  # three deviations and more from a side
+    error = (observation - true)[inside]
+    assert error.std() == pytest.approx(std, rel=0.1)  # some 500 draws: 3 standard errors
+    assert error.mean() == pytest.approx(0.0, abs=4.0 * std / np.sqrt(len(error)))
+    expected = np.clip(true + std * np.random.default_rng(1).standard_normal(true.shape), -1.0, 1.0)
+    at_a_side = (np.abs(observation) == 1.0).mean(), (np.abs(expected) == 1.0).mean()
+    assert at_a_side[0] == pytest.approx(at_a_side[1], abs=0.02)  # 4 standard errors of 8,000 draws
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_noisy_siblings_are_the_same_alone_and_in_a_batch_up_to_their_end(level):
+    env_id, n_steps = f"beliefgym/PendulumPositionNoisy{level}-v0", LEVELS[level][1]
+    batch = gym.make_vec(env_id, num_envs=3, vectorization_mode="vector_entry_point")
+    alone = gym.make(env_id)
+    seen, _ = batch.reset(seed=7)
+    one, _ = alone.reset(seed=9)
+    rng = np.random.default_rng(0)
+    for t in range(n_steps):
+        assert np.array_equal(seen[2], one)
+        actions = rng.uniform(-2.0, 2.0, (3, 1)).astype(np.float32)
+        seen, rewards, _, truncated, _ = batch.step(actions)
+        one, reward, terminated, ended, _ = alone.step(actions[2])
+        assert reward == rewards[2]
+        assert not terminated
+        assert bool(truncated[2]) == ended == (t + 1 == n_steps)
+
+
+def test_noise_hides_the_position_and_changes_neither_motion_nor_reward():
+    noisy, plain = (gym.make(f"beliefgym/PendulumPosition{kind}-v0") for kind in ("NoisyHard", ""))
+    seen, exact = noisy.reset(seed=3)[0], plain.reset(seed=3)[0]
+    for _ in range(20):
+        assert not np.array_equal(seen, exact)
+        assert np.array_equal(noisy.unwrapped.state, plain.unwrapped.state)
+        action = plain.action_space.sample()
+        (seen, reward, *_), (exact, expected, *_) = noisy.step(action), plain.step(action)
+        assert reward == expected
+
+
+def test_the_noise_is_a_parameter():
+    env = gym.make("beliefgym/PendulumPositionNoisyHard-v0", noise=0.0)
+    plain = gym.make("beliefgym/PendulumPosition-v0")
+    assert np.array_equal(env.reset(seed=3)[0], plain.reset(seed=3)[0])
