@@ -1,13 +1,13 @@
 """Hyperparameters of the Stable-Baselines3 agents, by task.
 
 The pendulum's are those that rl-zoo3 publishes: PPO and SAC for Pendulum-v1, recurrent PPO for the position-only
-pendulum (SAC on 4 environments with as many gradient steps, networks of 64 in place of 256 and a falling learning rate,
-which are our changes: as good here in a third of the time, and steadier at the end). The cart-pole's were chosen here on
+pendulum. SAC's changes are ours: 4 environments with as many gradient steps, networks of 64 in place of 256 and a
+falling learning rate, as good here in a third of the time, and steadier at the end. The cart-pole's were chosen here on
 validation seeds, with stacked frames and position only: PPO among 5 settings on training seeds 0 and 1, SAC among 2 on
 seed 0. Recurrent PPO on the cart-pole takes PPO's settings and was not tuned on its own, and neither were the agents
 without memory, so their scores there are lower bounds. Every other environment with continuous actions has one and the
-same untuned setting of PPO. A key is the start of an environment's name; "" is for every
-other environment. An agent with stacked frames takes the settings of the one without.
+same untuned setting of PPO, and of recurrent PPO. A key is the start of an environment's name; "" is for every other
+environment. An agent with stacked frames, or on beliefs, takes the settings of the one without.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ def _belief(algorithm: str, filter: str) -> Callable[[str], dict[str, Any]]:
         chosen = {**hyperparameters(algorithm, env_id), "filter": filter}
         if filter not in _LEARNED:
             return {**chosen, "filter": _known_filter(env_id)}
-        # chosen on validation episodes: hints on noisy sensors want a stronger ridge
+        # as `belief_filters` has it, written out so that a record says it
         is_noisy = filter == "psim-hints" and "Noisy" in env_id
         return {**chosen, "filter_options": {"alpha": 1e-4 if is_noisy else 1e-6}}
 
