@@ -1,8 +1,8 @@
 """Filters for policies, by name, fitted to the data of a task; and which hints a task has to offer.
 
-Settings were chosen on validation episodes of exact and noisy pendulums under random actions: `discount` below 1 forgets
-what the first, weak hypotheses met, which brings the error of the estimated velocity down to a half; a filter of hints
-wants a stronger ridge where sensors are noisy.
+Settings were chosen on validation episodes of exact and noisy pendulums under random actions: `discount` below 1
+forgets what the first, weak hypotheses met, which brings the error of the estimated velocity down to a half; a filter
+of hints wants a stronger ridge where sensors are noisy.
 """
 
 from __future__ import annotations

@@ -92,8 +92,8 @@ class ErrorCurves:
 def filter_jacobian(filter: Filter, belief: ArrayLike, observation: ArrayLike) -> Array:
     """J = dF / dm at each row: the matrix itself where it is constant, else by central differences in one batch.
 
-    Of F without the bounds that beliefs are kept in, and of a filter with actions at the average one. The step that a `ForwardPSIM` counts in its belief is no
-    coordinate of the state, and left out.
+    Of F without the bounds that beliefs are kept in, and of a filter with actions at the average one. The step that a
+    `ForwardPSIM` counts in its belief is no coordinate of the state, and left out.
 
     Args:
         filter: fitted. belief: (n, belief_size). observation: (n, n_obs), in the units of the training data.

@@ -14,7 +14,9 @@ covariance of all recorded actions (of choices: their frequencies), which varies
 from blind. With it Z_h, which the thesis leaves as "likely very hard to compute", is known: for any prescribed actions
 g sums to 1 over the observations, so that E_P[w | h] = sum_{tau^a} mu(tau^a) = 1 for every history. (With the thesis's
 weight it is the number, or the volume, of the action sequences, and also the same for every h.) That needs a policy
-which can take every action that mu takes.
+which can take every action that mu takes. The thesis's weight is for choices and for actions within bounds: where a
+policy's normal noise has none, 1 / pi has no finite mean. With "marginal" the weight of one action has a finite
+variance while the variance of what was recorded is below 4/3 of the noise's.
 
 What stands at the i-th place of a test depends on the actions before it alone, so that its weight may leave out the
 later ones: per-decision weights (Precup, Sutton & Singh 2000),

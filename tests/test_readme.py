@@ -194,3 +194,51 @@ def test_the_guide_to_actions_runs():
     exec(blocks[2], names)
     forecast = names["conditional"].forecast(names["belief"], 10, names["test"].actions[:, 20:])
     assert np.sqrt(np.square(forecast[:, :5] - names["test"].observations[:, 20:25]).mean()) < 0.3
+
+
+SHORT = {"20_000": "2_400", "n_iterations=30": "n_iterations=3", "n_frequencies=300": "n_frequencies=30"}
+
+
+def shortened(example):
+    for long, short in SHORT.items():
+        example = example.replace(long, short)
+    return example
+
+
+@in_checkout
+def test_two_lines_fit_and_wrap_a_belief():
+    (example,) = (block for block in blocks_of(README) if "BeliefObservation" in block)
+    fit, wrap = example.strip().splitlines()[-2:]
+    assert ".fit(" in fit
+    assert "BeliefObservation(" in wrap
+    names: dict = {"gym": pytest.importorskip("gymnasium")}
+    exec(example, names)
+    observation, _ = names["env"].reset(seed=0)
+    assert observation.shape == (2 + 10 * 2,)
+    assert np.isfinite(names["env"].step(names["env"].action_space.sample())[0]).all()
+
+
+@in_checkout
+def test_ten_lines_train_sac_on_a_belief(tmp_path, monkeypatch, capsys):
+    (example,) = (block for block in blocks_of(README) if "BeliefPolicy" in block)
+    assert len(example.strip().splitlines()) <= 10
+    assert 'algorithm="SAC"' in example
+    assert "PendulumPosition-v0" in example
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(shortened(example), names)
+    assert names["agent"].model.num_timesteps == 2_400
+    assert -1800 < float(capsys.readouterr().out) < 0
+    assert Path("belief.zip").exists()
+
+
+@in_checkout
+def test_the_guide_to_beliefs_runs(capsys):
+    blocks = blocks_of(README.parent / "docs" / "beliefs.md")
+    assert len(blocks) == 2
+    names: dict = {}
+    exec(shortened(blocks[0].replace("20_000", "400")), names)
+    assert names["model"].observation_space.shape == (2 + 10 * 2,)
+    exec(shortened(blocks[1]), names)
+    assert names["agent"].filter == "psim-hints"
+    assert -1800 < float(capsys.readouterr().out) < 0
