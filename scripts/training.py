@@ -78,7 +78,8 @@ class LearningCurve(BaseCallback):
         # An on-policy algorithm finishes its last rollout beyond the total; those steps get no further points.
         if self._next <= step < self._total:
             self.evaluate(step)
-            self._next += self._every
+            while self._next <= step:  # an agent that explores first has passed some points unseen
+                self._next += self._every
         if step - self._told >= self._total / 100:
             self._told = step
             note = f"{self.curve[-1]['mean_return']:.1f}" if self.curve else ""
