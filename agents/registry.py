@@ -134,6 +134,14 @@ def _sb3(algorithm: str, **more: Any) -> Callable[[str], dict[str, Any]]:
     return lambda env_id: {**hyperparameters(algorithm, env_id), **more}
 
 
+def _sac_stack(env_id: str) -> dict[str, Any]:
+    """SAC's options with 4 frames; on the pendulum with a constant learning rate, which stacks are better with there."""
+    options = {**hyperparameters("SAC", env_id), "n_stack": 4}
+    if env_id.rpartition("/")[2].startswith("Pendulum"):
+        options["arguments"] = {**options["arguments"], "learning_rate": 1e-3}
+    return options
+
+
 def _belief(algorithm: str, filter: str) -> Callable[[str], dict[str, Any]]:
     """The algorithm's usual options on beliefs, whatever they are without."""
 
@@ -174,7 +182,7 @@ for _spec in (
     AgentSpec("ppo", _SB3, "SB3's PPO on the last observation alone", _sb3("PPO")),
     AgentSpec("ppo-stack", _SB3, "SB3's PPO on the last 4 observations", _sb3("PPO", n_stack=4)),
     AgentSpec("sac", _SB3, "SB3's SAC on the last observation alone", _sb3("SAC")),
-    AgentSpec("sac-stack", _SB3, "SB3's SAC on the last 4 observations", _sb3("SAC", n_stack=4)),
+    AgentSpec("sac-stack", _SB3, "SB3's SAC on the last 4 observations", _sac_stack),
     AgentSpec(
         "dad-control",
         "beliefgym.agents.dad_control:DaDControl",
