@@ -135,7 +135,7 @@ def _sb3(algorithm: str, **more: Any) -> Callable[[str], dict[str, Any]]:
 
 
 def _sac_stack(env_id: str) -> dict[str, Any]:
-    """SAC's options with 4 frames; on the pendulum with a constant learning rate, which stacks are better with there."""
+    """SAC with 4 frames; on the pendulum with a constant learning rate, which stacks are better with there."""
     options = {**hyperparameters("SAC", env_id), "n_stack": 4}
     if env_id.rpartition("/")[2].startswith("Pendulum"):
         options["arguments"] = {**options["arguments"], "learning_rate": 1e-3}
