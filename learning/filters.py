@@ -16,6 +16,7 @@ References: thesis proposal, Secs. 3.3.1, 3.3.2 and 4.2. There time starts at 1;
 
 from __future__ import annotations
 
+import sys
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -314,7 +315,7 @@ class Filter(BaseEstimator, ABC):
                 f"{following[row, component]:g} in standardised units, bound {bound[component]:g}) and is kept inside; "
                 "this is told once. Observations unlike the training data, or an unstable filter, do that",
                 DivergenceWarning,
-                stacklevel=4,
+                stacklevel=_level_of_user(),
             )
         following = np.where(np.isnan(following), belief, following)
         return np.clip(following, -bound, bound)
@@ -439,6 +440,14 @@ class Filter(BaseEstimator, ABC):
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "n_obs_") and hasattr(self, self._fitted_attribute)
+
+
+def _level_of_user() -> int:
+    """The `stacklevel` with which a warning of the caller points at the code that uses this package."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("beliefgym."):
+        frame, level = frame.f_back, level + 1
+    return level
 
 
 def check_finite(what: str, array: Array) -> None:
