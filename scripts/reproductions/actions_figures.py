@@ -19,6 +19,7 @@ from beliefgym.scripts.reproductions.actions_methods import (
     CONDITIONAL,
     CONDITIONAL_IS,
     DECISION,
+    METHODS,
     NAIVE,
     ORDINARY,
     PLAIN,
@@ -48,17 +49,6 @@ MARKERS = {"output": "o", "cancelling": "s", "ring": "^"}
 SHORT = {"output": "linear, feedback of x", "cancelling": "linear, cancelling", "ring": "ring of places"}
 FIVE = AHEAD.index(5)
 BELIEF = (UNWEIGHED, ORDINARY, WEIGHTED, DECISION, TRUNCATED, CONDITIONAL_IS)
-SIMULATION = (
-    PLAIN,
-    NAIVE,
-    UNWEIGHED,
-    ORDINARY,
-    WEIGHTED,
-    DECISION,
-    TRUNCATED,
-    CONDITIONAL,
-    CONDITIONAL_IS,
-)
 
 
 def figure(path: Path, found: Found, levels: Mapping[str, tuple[float, ...]]) -> None:
@@ -69,10 +59,10 @@ def figure(path: Path, found: Found, levels: Mapping[str, tuple[float, ...]]) ->
         _belief(belief, found, levels["output"])
         _simulation(simulation, found, levels["cancelling"])
         _samples(samples, found)
-        lines = [Line2D([], [], color=COLOURS[name], marker="o", markersize=4) for name in SIMULATION]
+        lines = [Line2D([], [], color=COLOURS[name], marker="o", markersize=4) for name in METHODS]
         made.legend(
             lines,
-            SIMULATION,
+            METHODS,
             loc="outside lower center",
             ncols=5,
             frameon=False,
@@ -111,7 +101,7 @@ def _belief(axes: Axes, found: Found, gains: tuple[float, ...]) -> None:
 
 def _simulation(axes: Axes, found: Found, gains: tuple[float, ...]) -> None:
     """Error of forecasts under blind actions, by the gain of the recorded feedback that cancels."""
-    for name in SIMULATION:
+    for name in METHODS:
         errors = [
             [1.0 + o["methods"][name]["excess"]["blind"][FIVE] for o in found.get(("cancelling", g), [])]
             for g in gains
