@@ -1,0 +1,147 @@
+"""`RecurrentQSARSA`: on-policy recurrent Q learning that is consistent in time (Sec. 4.3).
+
+    repeat:  h_t of pi_i's network along every running episode, from its start (consistency)
+             act with pi_{i+1}(x) = arg max_a Q^{pi_i}(h_t, a) (Eq. 4.18), softened: soft-max and epsilon
+             fit Q to the Bellman residuals of what was recorded (Eq. 4.17), by gradients through time
+
+What is new against the thesis proposal, and why. The network that acts and that targets are taken from is an average
+of the fitted ones over the last gradient steps (`average`), and the arg max is softened (`temperature`): policies then change
+slowly, while every one of them is learned about. Rollouts of older policies are used again (`reuse`), weighted by
+min(1, pi / mu) at each step; the proposal names that as an option. `average=0`, `temperature=0`, `reuse=1`,
+`bootstrap="taken"` and `gradient="residual"` is the proposal to the letter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from beliefgym.agents.recurrent.auxiliary import make_auxiliary
+from beliefgym.agents.recurrent.collector import RolloutCollector
+from beliefgym.agents.recurrent.q_agent import RecurrentQAgent
+from beliefgym.agents.recurrent.sarsa_loss import Bootstrap, Gradient, RecurrentSarsaLoss
+from beliefgym.wrappers.task import Task
+
+
+class RecurrentQSARSA(RecurrentQAgent):
+    """Recurrent-Q SARSA.
+
+    Args:
+        task, seed: see `RecurrentQAgent`, which takes all further arguments.
+        reuse: rollouts that are learned from at a time, the newest among them.
+        n_batches: gradient steps after each rollout; together they go once through what is kept.
+        average: the share that stays of the averaged network at each gradient step; 0 for no average.
+        bootstrap, gradient, n_steps, weights: see `RecurrentSarsaLoss`.
+        refresh: False carries hidden states on from one rollout to the next, though the network has changed.
+        auxiliary: objectives by name with their options: "weight" (lambda; "linear:0.5" falls to 0), "k", "on_hidden".
+
+    Raises:
+        ValueError: settings that contradict each other; see `RecurrentSarsaLoss`.
+
+    Example:
+        >>> agent = RecurrentQSARSA("beliefgym/CartPoleBalancePosition-v0").learn(50_000)  # doctest: +SKIP
+
+    Reference: thesis proposal, Sec. 4.3.1 and 4.3.2.
+    """
+
+    def __init__(
+        self,
+        task: Task | str,
+        seed: int = 0,
+        *,
+        reuse: int = 32,
+        n_batches: int = 16,
+        average: float = 0.98,
+        bootstrap: Bootstrap = "expected",
+        gradient: Gradient = "semi",
+        n_steps: int | None = None,
+        weights: float | list[float] = 0.9,
+        refresh: bool = True,
+        temperature: float = 0.05,
+        auxiliary: Mapping[str, Mapping[str, Any]] | None = None,
+        **shared: Any,
+    ) -> None:
+        self._own: dict[str, Any] = {
+            "reuse": reuse,
+            "n_batches": n_batches,
+            "average": average,
+            "bootstrap": bootstrap,
+            "gradient": gradient,
+            "n_steps": n_steps,
+            "weights": weights,
+            "refresh": refresh,
+            "auxiliary": {name: dict(options) for name, options in (auxiliary or {}).items()},
+        }
+        if reuse < 1 or n_batches < 1:
+            raise ValueError(f"expected reuse and n_batches of at least 1, got {reuse} and {n_batches}")
+        if reuse > 1 and bootstrap == "taken":
+            raise ValueError(
+                'rollouts of older policies (reuse > 1) show what those did next, not this policy: take bootstrap="expected"'
+                ", or reuse=1"
+            )
+        self._rollouts: list[TensorDict] = []
+        super().__init__(task, seed, temperature=temperature, **shared)
+        self._average = SoftUpdate(self.loss, eps=average) if average > 0.0 else None
+
+    def make_loss(self) -> RecurrentSarsaLoss:
+        """See `RecurrentQAgent.make_loss`."""
+        own = self._own
+        n_observation = self.observation_space.shape[0]  # type: ignore[index]
+        objectives = {
+            name: make_auxiliary(
+                name,
+                self._options["hidden_size"],
+                n_observation,
+                self.n_actions,
+                **{key: value for key, value in options.items() if key != "weight"},
+            )
+            for name, options in own["auxiliary"].items()
+        }
+        return RecurrentSarsaLoss(
+            self.network,
+            gamma=self.gamma,
+            n_steps=own["n_steps"],
+            weights=own["weights"],
+            bootstrap=own["bootstrap"],
+            gradient=own["gradient"],
+            importance=own["reuse"] > 1,
+            delay_value=own["average"] > 0.0,
+            auxiliary=objectives,
+        )
+
+    def before_rollout(self, collector: RolloutCollector) -> dict[str, Any]:
+        """Roll the hidden states of running episodes anew with the network that will act."""
+        return {"state_drift": collector.refresh(self.acting.encoder)} if self._own["refresh"] else {}
+
+    def improve(self, rollout: TensorDict, progress: float) -> dict[str, Any]:
+        """Fit Q to the rollouts that are kept; see `RecurrentQAgent.improve`."""
+        self.loss.auxiliary_weights = {
+            name: _annealed(options.get("weight", 1.0), progress)
+            for name, options in self._own["auxiliary"].items()
+        }
+        self._rollouts = (
+            [*self._rollouts[-(self._own["reuse"] - 1) :], rollout] if self._own["reuse"] > 1 else [rollout]
+        )
+        rows = torch.cat(self._rollouts) if len(self._rollouts) > 1 else rollout
+        order = torch.randperm(len(rows), generator=self._random)
+        for chosen in order.chunk(self._own["n_batches"]):
+            answer = self.step_optimizer(rows[chosen])
+            if self._average is not None:
+                self._average.step()
+        self.sync_acting()
+        return {key: float(value) for key, value in answer.items()}
+
+    def options(self) -> dict[str, Any]:
+        """See `Agent.options`."""
+        return {**super().options(), **self._own}
+
+
+def _annealed(weight: float | str, progress: float) -> float:
+    """A constant, or "linear:w" for w (1 - progress)."""
+    if isinstance(weight, str):
+        return float(weight.removeprefix("linear:")) * (1.0 - progress)
+    return float(weight)
