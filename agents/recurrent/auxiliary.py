@@ -2,17 +2,18 @@
 
     loss = Bellman residual + sum_j lambda_j mean_t |f_j(h_t) - target_j,t|^2
 
-h_t has seen x_t, a_{t-1} and all before. With a decoder f is linear; on the hidden state itself f picks the first entries
-of h_t, which then *are* the prediction (h_{t+1} = phi_{t+1} in Fig. 4.5; h_t in R^k for rewards). Entries of an LSTM or a
-GRU lie in (-1, 1): targets are standardised by running moments and, on the hidden state, divided by 3.
+h_t has seen x_t, a_{t-1} and all before. With a decoder f is linear; on the hidden state itself f picks the first
+entries of h_t, which then *are* the prediction (h_{t+1} = phi_{t+1} in Fig. 4.5; h_t in R^k for rewards). Entries of
+an LSTM or a GRU lie in (-1, 1): targets are standardised by running moments and, on the hidden state, divided by 3.
 
-References: thesis proposal, Sec. 4.3.2, Eq. 4.19 (dynamics), H6 (predictive state), H7 (predictive rewards, future values);
-Venkatraman et al. 2017 (predictive-state decoders); Ni et al. 2024 (latent self-prediction).
+References: thesis proposal, Sec. 4.3.2, Eq. 4.19 (dynamics), H6 (predictive state), H7 (predictive rewards, future
+values); Venkatraman et al. 2017 (predictive-state decoders); Ni et al. 2024 (latent self-prediction).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -29,7 +30,8 @@ class Pieces:
         hidden: (n_pieces, n_steps + 1, hidden_size) h of every slot. target_hidden: the same of the averaged network,
             without gradient.
         observation: (n_pieces, n_steps + 1, n_observation), standardised. actions: (n_pieces, n_steps, n_action).
-        rewards: (n_pieces, n_steps). returns: (n_pieces, n_steps) discounted, to the piece's end and bootstrapped there.
+        rewards: (n_pieces, n_steps). returns: (n_pieces, n_steps) discounted, to the piece's end and bootstrapped
+            there.
         mask: (n_pieces, n_steps) bool, the steps that exist.
     """
 
@@ -62,8 +64,8 @@ class AuxiliaryObjective(nn.Module, ABC):
         super().__init__()
         if on_hidden and hidden_size < target_size:
             raise ValueError(
-                f"expected a hidden state of at least {target_size} to hold the prediction of {self.name!r} itself, got "
-                f"{hidden_size}; take a larger hidden_size, a smaller k, or a decoder (on_hidden=False)"
+                f"expected a hidden state of at least {target_size} to hold the prediction of {self.name!r} itself, "
+                f"got {hidden_size}; take a larger hidden_size, a smaller k, or a decoder (on_hidden=False)"
             )
         self.on_hidden, self.target_size = on_hidden, target_size
         self.decoder = None if on_hidden else nn.Linear(hidden_size, target_size)
@@ -176,8 +178,8 @@ class PredictiveValues(AuxiliaryObjective):
 class Dynamics(AuxiliaryObjective):
     """The next observation under the action taken (Eq. 4.19): |f(h_t, a_t) - x_{t+1}|^2.
 
-    Eq. 4.19 writes f(h_t) and s_{t+1}: the action that leads there is put beside h_t, and the observation in the state's
-    place.
+    Eq. 4.19 writes f(h_t) and s_{t+1}: the action that leads there is put beside h_t, and the observation in the
+    state's place.
 
     Args:
         hidden_size, n_observation, n_action: sizes.
@@ -224,6 +226,12 @@ class LatentSelfPrediction(nn.Module):
         return (errors * weights).sum() / weights.sum().clamp(min=1.0)
 
 
+OBJECTIVES: dict[str, Callable[..., nn.Module]] = {
+    kind.name: kind
+    for kind in (Dynamics, PredictiveState, PredictiveRewards, PredictiveValues, LatentSelfPrediction)
+}
+
+
 def make_auxiliary(
     name: str, hidden_size: int, n_observation: int, n_action: int, **options: object
 ) -> nn.Module:
@@ -239,10 +247,7 @@ def make_auxiliary(
         "predictive_values": {},
         "latent_self_prediction": {"n_action": n_action},
     }
-    kinds: tuple[type[nn.Module], ...] = (
-        *(Dynamics, PredictiveState, PredictiveRewards, PredictiveValues, LatentSelfPrediction),
-    )
     if name not in sizes:
         raise ValueError(f"expected an auxiliary objective out of {', '.join(sizes)}, got {name!r}")
-    kind = next(kind for kind in kinds if kind.name == name)
-    return kind(hidden_size=hidden_size, **sizes[name], **options)
+    module: nn.Module = OBJECTIVES[name](hidden_size=hidden_size, **sizes[name], **options)
+    return module

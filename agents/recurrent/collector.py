@@ -1,11 +1,12 @@
 """Rollouts of a vector environment in TorchRL's layout, with the memory of the network that acts.
 
-Every copy goes on with its episode from one rollout to the next. `previous_action` and `previous_reward` are part of what
-is recorded, under "next" too, so that a network can be run over any piece of it.
+Every copy goes on with its episode from one rollout to the next. `previous_action` and `previous_reward` are part of
+what is recorded, under "next" too, so that a network can be run over any piece of it.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -83,8 +84,8 @@ class RolloutCollector:
 
         Returns:
             (n, n_steps): "observation", "previous_action", "previous_reward", "recurrent_state" (before the step),
-            "is_init", "action", "action_probability", and under "next" "observation" (an episode's last where it ended),
-            "previous_action", "previous_reward", "reward", "terminated", "truncated", "done".
+            "is_init", "action", "action_probability", and under "next" "observation" (an episode's last where it
+            ended), "previous_action", "previous_reward", "reward", "terminated", "truncated", "done".
         """
         self.finished = []
         rows: dict[str, list[Tensor]] = {name: [] for name in (*_KEYS, *_NEXT)}
@@ -188,8 +189,8 @@ class _RunningEpisodes:
         lengths = self.lengths[order]
         states = self._stores[0].new_zeros(len(order), state_size)
         longest = int(lengths[0])
-        joins = sorted({longest - int(length) for length in lengths if length > 0}) + [longest]
-        for begin, end in zip(joins[:-1], joins[1:], strict=True):
+        joins = sorted({longest - int(length) for length in lengths if length > 0} | {longest})
+        for begin, end in pairwise(joins):
             n = int((lengths >= longest - begin).sum())  # those that have begun
             rows = torch.from_numpy(order[:n])[:, None]
             steps = torch.arange(begin, end) - torch.from_numpy(longest - lengths[:n])[:, None]

@@ -7,6 +7,7 @@ A state (n, state_size) is h of a GRU, [h, c] of an LSTM, nothing where there is
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -76,11 +77,11 @@ class NoMemory(Memory):
         return hidden, state
 
 
-MEMORIES: dict[str, type[Memory]] = {"lstm": LSTM, "gru": GRU, "none": NoMemory}
+MEMORIES: dict[str, Callable[[int, int], Memory]] = {"lstm": LSTM, "gru": GRU, "none": NoMemory}
 
 
-def make_memory(cell: str | type[Memory], input_size: int, hidden_size: int) -> Memory:
-    """A memory by name, or of a class of one's own.
+def make_memory(cell: str | Callable[[int, int], Memory], input_size: int, hidden_size: int) -> Memory:
+    """A memory by name, or of a class of one's own, which is called with the two sizes.
 
     Raises:
         ValueError: an unknown name. TypeError: something that is no `Memory`.
@@ -91,6 +92,7 @@ def make_memory(cell: str | type[Memory], input_size: int, hidden_size: int) -> 
                 f"expected cell to be one of {', '.join(MEMORIES)}, or a class of your own, got {cell!r}"
             )
         return MEMORIES[cell](input_size, hidden_size)
-    if not (isinstance(cell, type) and issubclass(cell, Memory)):
+    memory = cell(input_size, hidden_size) if callable(cell) else cell
+    if not isinstance(memory, Memory):
         raise TypeError(f"expected a cell as a name or a subclass of Memory, got {cell!r}")
-    return cell(input_size, hidden_size)
+    return memory

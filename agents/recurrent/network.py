@@ -9,6 +9,7 @@ x is standardised by running moments; layer normalisation keeps values from runn
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -43,7 +44,7 @@ class HistoryEncoder(nn.Module):
         n_action: int,
         hidden_size: int = 64,
         width: int = 64,
-        cell: str | type[Memory] = "lstm",
+        cell: str | Callable[[int, int], Memory] = "lstm",
         rewards: bool = False,
         previous_actions: bool = True,
     ) -> None:
@@ -109,8 +110,8 @@ class RecurrentQNetwork(TensorDictModuleBase):
 
     Reads "observation", "previous_action", "previous_reward", "recurrent_state" and "is_init"; writes "action_value",
     "hidden" and ("next", "recurrent_state"). Under TorchRL's `set_recurrent_mode` the batch is (n, n_steps) and the
-    recurrent state that of the first step, with episodes that may begin anywhere (`is_init`); else it is (n,), one step.
-    Under it ("next", "recurrent_state") is the state after each row's last step, repeated along the row.
+    recurrent state that of the first step, with episodes that may begin anywhere (`is_init`); else it is (n,), one
+    step. Under it ("next", "recurrent_state") is the state after each row's last step, repeated along the row.
 
     Args:
         encoder: the history's encoder. n_actions: number of actions. width: of the layer in the head.
@@ -143,14 +144,16 @@ class RecurrentQNetwork(TensorDictModuleBase):
         if not recurrent_mode():
             state = torch.where(is_init[..., None], 0.0, state)
             flat = state.reshape(-1, self.state_size)
-            values, hidden, after = self.values(*(x.reshape(len(flat), 1, -1) for x in seen), flat)
+            observation, action, reward = (x.reshape(len(flat), 1, -1) for x in seen)
+            values, hidden, after = self.values(observation, action, reward, flat)
             shape = state.shape[:-1]
             tensordict.set("action_value", values.reshape(*shape, -1))
             tensordict.set("hidden", hidden.reshape(*shape, -1))
             return tensordict.set(("next", "recurrent_state"), after.reshape(*shape, -1))
         pieces = Segments(is_init)
         first = torch.where(pieces.fresh[:, None], 0.0, state[:, 0][pieces.rows])
-        values, hidden, after = self.values(*(pieces.steps(x) for x in seen), first)
+        observation, action, reward = (pieces.steps(x) for x in seen)
+        values, hidden, after = self.values(observation, action, reward, first)
         n, n_steps = is_init.shape
         tensordict.set("action_value", pieces.back(values).view(n, n_steps, -1))
         tensordict.set("hidden", pieces.back(hidden).view(n, n_steps, -1))

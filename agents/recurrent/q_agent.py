@@ -1,9 +1,9 @@
-"""What the recurrent agents that learn action values share: network, collector, exploration, Stable-Baselines3's face."""
+"""What recurrent agents that learn action values share: network, collector, exploration, SB3's face."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from typing import Any, NamedTuple, Self
 
@@ -74,7 +74,7 @@ class RecurrentQAgent(Agent):
         bins: int | None = None,
         n_envs: int = 8,
         rollout_steps: int = 32,
-        cell: str | type[Memory] = "lstm",
+        cell: str | Callable[[int, int], Memory] = "lstm",
         hidden_size: int = 64,
         width: int = 64,
         previous_actions: bool = True,
@@ -306,8 +306,8 @@ class RecurrentQAgent(Agent):
 
     @torch.no_grad()
     def _act(self, seen: Seen, epsilon: float, temperature: float) -> Acted:
-        inputs = (x[:, None] for x in seen[:3])
-        values, _, state = self.acting.values(*inputs, seen.state)
+        observation, action, reward = (x[:, None] for x in seen[:3])
+        values, _, state = self.acting.values(observation, action, reward, seen.state)
         probabilities = action_probabilities(values[:, 0], epsilon, temperature)
         if epsilon == 0.0 and temperature == 0.0:
             action = probabilities.argmax(-1)
@@ -352,8 +352,9 @@ class RecurrentQAgent(Agent):
             return
         raise DivergenceError(
             f"{type(self).__name__} on {self.task.label} has diverged at step {self.num_timesteps}: loss "
-            f"{float(total):.3g}, largest |Q| {largest:.3g} in units of scaled rewards (scale {self._reward_scale:.3g}). "
-            f"Try a smaller learning_rate (now {self._options['learning_rate']}), a smaller max_grad_norm or gamma"
+            f"{float(total):.3g}, largest |Q| {largest:.3g} in units of scaled rewards (scale "
+            f"{self._reward_scale or 1.0:.3g}). Try a smaller learning_rate (now {self._options['learning_rate']}), a "
+            "smaller max_grad_norm or gamma"
             + (', or gradient="semi"' if self.loss.gradient == "residual" else "")
         )
 

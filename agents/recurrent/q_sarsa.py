@@ -5,9 +5,9 @@
              fit Q to the Bellman residuals of what was recorded (Eq. 4.17), by gradients through time
 
 What is new against the thesis proposal, and why. The network that acts and that targets are taken from is an average
-of the fitted ones over the last gradient steps (`average`), and the arg max is softened (`temperature`): policies then change
-slowly, while every one of them is learned about. Rollouts of older policies are used again (`reuse`), weighted by
-min(1, pi / mu) at each step; the proposal names that as an option. `average=0`, `temperature=0`, `reuse=1`,
+of the fitted ones over the last gradient steps (`average`), and the arg max is softened (`temperature`): policies then
+change slowly, while every one of them is learned about. Rollouts of older policies are used again (`reuse`), weighted
+by min(1, pi / mu) at each step; the proposal names that as an option. `average=0`, `temperature=0`, `reuse=1`,
 `bootstrap="taken"` and `gradient="residual"` is the proposal to the letter.
 """
 
@@ -80,8 +80,8 @@ class RecurrentQSARSA(RecurrentQAgent):
             raise ValueError(f"expected reuse and n_batches of at least 1, got {reuse} and {n_batches}")
         if reuse > 1 and bootstrap == "taken":
             raise ValueError(
-                'rollouts of older policies (reuse > 1) show what those did next, not this policy: take bootstrap="expected"'
-                ", or reuse=1"
+                "rollouts of older policies (reuse > 1) show what those did next, not this policy: take "
+                'bootstrap="expected", or reuse=1'
             )
         self._rollouts: list[TensorDict] = []
         super().__init__(task, seed, temperature=temperature, **shared)

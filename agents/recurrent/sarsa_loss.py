@@ -1,6 +1,7 @@
 """The loss of Recurrent-Q SARSA as a loss module of TorchRL's, to be used alone or by the agents here.
 
-    l_t = sum_{n=0}^{k} w_n |Q_t(x_t, a_t) - (sum_{i=0}^{n} gamma^i r_{t+i} + gamma^{n+1} Q_{t+n+1}(x_{t+n+1}, a_{t+n+1}))|^2
+    l_t = sum_{n=0}^{k} w_n |Q_t(x_t, a_t) - y_t^n|^2
+    y_t^n = sum_{i=0}^{n} gamma^i r_{t+i} + gamma^{n+1} Q_{t+n+1}(x_{t+n+1}, a_{t+n+1})
 
 Q_t depends on all that was seen up to t through the network's hidden state, which is rolled along the recorded episode:
 the actions in it are those that were taken, so the states are those that the policy was in (temporal consistency).
@@ -34,8 +35,8 @@ class RecurrentSarsaLoss(LossModule):
     """Bellman residuals of a recurrent Q network along recorded rollouts, with auxiliary objectives.
 
     The input is a tensordict (n, n_steps) in TorchRL's layout, as a collector or this package's gives it: rows may hold
-    several episodes (`is_init`), or be padded ("mask"). What followed an episode's last step is seen by the network too, so
-    that a truncation is bootstrapped and a termination is not.
+    several episodes (`is_init`), or be padded ("mask"). What followed an episode's last step is seen by the network
+    too, so that a truncation is bootstrapped and a termination is not.
 
     Args:
         value_network: reads its keys under TorchRL's recurrent mode and writes "action_value" and "hidden"; a
@@ -270,7 +271,7 @@ class RecurrentSarsaLoss(LossModule):
         return lambda_returns(rewards, discounts, expected, carried, expected)
 
     def _standardised(self, observation: Tensor) -> Tensor:
-        encoder = getattr(self.value_network, "encoder", None)
+        encoder: Any = getattr(self.value_network, "encoder", None)
         return encoder.standardised(observation) if hasattr(encoder, "standardised") else observation
 
     @staticmethod

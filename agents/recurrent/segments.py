@@ -1,11 +1,11 @@
 """Pieces of rollouts that lie within one episode, padded to one length.
 
-A rollout is a batch of rows (n, n_steps) in TorchRL's layout: several episodes may end and begin in a row (`is_init`), and
-what followed a step stands under "next": at an episode's end, the last observation, which no row of the batch shows. A
-recurrent network has to go through every episode from its own start and has to see its last observation too, since
-an episode that was cut (truncated) is not over. So rows are cut where episodes begin, every piece gets one more slot for
-what followed its last step, and the pieces are padded: a network then runs over (n_pieces, n_steps' + 1) with no reset
-inside, and the value after step t is always that of slot t + 1.
+A rollout is a batch of rows (n, n_steps) in TorchRL's layout: several episodes may end and begin in a row (`is_init`),
+and what followed a step stands under "next": at an episode's end, the last observation, which no row of the batch
+shows. A recurrent network has to go through every episode from its own start and has to see its last observation too,
+since an episode that was cut (truncated) is not over. So rows are cut where episodes begin, every piece gets one more
+slot for what followed its last step, and the pieces are padded: a network then runs over (n_pieces, n_steps' + 1) with
+no reset inside, and the value after step t is always that of slot t + 1.
 """
 
 from __future__ import annotations

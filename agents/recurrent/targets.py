@@ -1,8 +1,8 @@
 """What action values are fitted to: bootstrapped returns along pieces of episodes.
 
-All arrays are (n_pieces, n_steps). Step t was taken in slot t and led to slot t + 1, whose value is V_{t+1}: that of the
-action that was taken there (SARSA), the expectation over the policy, or the largest. d_t = gamma (1 - terminated_t), so
-that a termination has no value after it, and a truncation, or the end of a piece, has.
+All arrays are (n_pieces, n_steps). Step t was taken in slot t and led to slot t + 1, whose value is V_{t+1}: that of
+the action that was taken there (SARSA), the expectation over the policy, or the largest. d_t = gamma (1 -
+terminated_t), so that a termination has no value after it, and a truncation, or the end of a piece, has.
 """
 
 from __future__ import annotations
