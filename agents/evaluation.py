@@ -47,7 +47,8 @@ def evaluate(
     being short, and two agents meet the same starts.
 
     Args:
-        agent: anything with SB3's `predict`; its `set_env`, if it has one, is called for beliefgym agents.
+        agent: anything with SB3's `predict`; its `set_env`, if it has one, is called for beliefgym agents, and its
+            `tell_reward` after each step where it says `needs_rewards`.
         task: the task or environment id.
         n_episodes: number of episodes.
         seed: seed of the first episode.
@@ -75,6 +76,8 @@ def evaluate(
             observation, state=state, episode_start=start, deterministic=deterministic
         )
         observation, reward, terminated, truncated, _ = env.step(action)
+        if getattr(agent, "needs_rewards", False):
+            agent.tell_reward(reward)
         returns += np.where(running, reward, 0.0)
         lengths += running
         start = terminated | truncated

@@ -30,8 +30,8 @@ class Pieces:
         hidden: (n_pieces, n_steps + 1, hidden_size) h of every slot. target_hidden: the same of the averaged network,
             without gradient.
         observation: (n_pieces, n_steps + 1, n_observation), standardised. actions: (n_pieces, n_steps, n_action).
-        rewards: (n_pieces, n_steps). returns: (n_pieces, n_steps) discounted, to the piece's end and bootstrapped
-            there.
+        rewards: (n_pieces, n_steps). returns: gives (n_pieces, n_steps) discounted returns, bootstrapped at the
+            end of each piece.
         mask: (n_pieces, n_steps) bool, the steps that exist.
     """
 
@@ -40,7 +40,7 @@ class Pieces:
     observation: Tensor
     actions: Tensor
     rewards: Tensor
-    returns: Tensor
+    returns: Callable[[], Tensor]
     mask: Tensor
 
 
@@ -172,7 +172,7 @@ class PredictiveValues(AuxiliaryObjective):
 
     def targets(self, pieces: Pieces) -> tuple[Tensor, Tensor]:
         """See `AuxiliaryObjective.targets`."""
-        return futures(pieces.returns[..., None], self.k, pieces.mask)
+        return futures(pieces.returns()[..., None], self.k, pieces.mask)
 
 
 class Dynamics(AuxiliaryObjective):

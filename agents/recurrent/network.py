@@ -138,7 +138,11 @@ class RecurrentQNetwork(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase, *arguments: Any, **more: Any) -> TensorDictBase:
         """See the class."""
-        seen = [tensordict.get(key) for key in HISTORY_KEYS]
+        seen = (
+            tensordict.get("observation"),
+            tensordict.get("previous_action"),
+            tensordict.get("previous_reward"),
+        )
         is_init = tensordict.get("is_init")[..., 0]
         state = tensordict.get("recurrent_state")
         if not recurrent_mode():
@@ -150,6 +154,12 @@ class RecurrentQNetwork(TensorDictModuleBase):
             tensordict.set("action_value", values.reshape(*shape, -1))
             tensordict.set("hidden", hidden.reshape(*shape, -1))
             return tensordict.set(("next", "recurrent_state"), after.reshape(*shape, -1))
+        if not is_init[:, 1:].any():  # every row lies within one episode
+            first = torch.where(is_init[:, :1], 0.0, state[:, 0])
+            values, hidden, after = self.values(*seen, first)
+            tensordict.set("action_value", values)
+            tensordict.set("hidden", hidden)
+            return tensordict.set(("next", "recurrent_state"), after[:, None].expand(*is_init.shape, -1))
         pieces = Segments(is_init)
         first = torch.where(pieces.fresh[:, None], 0.0, state[:, 0][pieces.rows])
         observation, action, reward = (pieces.steps(x) for x in seen)

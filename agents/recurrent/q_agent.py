@@ -129,7 +129,9 @@ class RecurrentQAgent(Agent):
             self.loss = self.make_loss()
         self.acting = deepcopy(self.network)
         self._random = torch.Generator().manual_seed(seed)
-        self.optimizer = torch.optim.RAdam(self.loss.parameters(), lr=self._learning_rate_at(0.0))
+        self.optimizer = torch.optim.RAdam(
+            self.loss.parameters(), lr=self._learning_rate_at(0.0), foreach=True
+        )
 
     @abstractmethod
     def make_loss(self) -> RecurrentSarsaLoss:

@@ -175,7 +175,7 @@ class RecurrentSarsaLoss(LossModule):
                 self._standardised(rolled.get(keys.observation)),
                 nn.functional.one_hot(action, values.shape[-1]).to(rewards.dtype),
                 rewards,
-                self._returns(pieces, rewards, discounts, later),
+                lambda: self._returns(pieces, rewards, discounts, later),
                 pieces.mask,
             )
             for name, objective in self.auxiliary.items():
