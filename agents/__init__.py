@@ -1,5 +1,8 @@
 """What acts: experts, baselines and learned agents, all in Stable-Baselines3's face."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from beliefgym.agents.agent import Agent
 from beliefgym.agents.belief_policy import BeliefPolicy
 from beliefgym.agents.dad_control import DaDControl
@@ -25,7 +28,19 @@ from beliefgym.agents.sb3_agent import SB3Agent
 from beliefgym.agents.sb3_log_probs import with_log_probs
 from beliefgym.agents.system_identification import SystemIdentification
 
+if TYPE_CHECKING:
+    from beliefgym.agents.recurrent import (
+        DRQN,
+        R2D2,
+        RecurrentPQN,
+        RecurrentQSARSA,
+        RecurrentSAC,
+        RecurrentSarsaLoss,
+    )
+
 __all__ = [
+    "DRQN",
+    "R2D2",
     "Agent",
     "AgentSpec",
     "BeliefPolicy",
@@ -37,6 +52,10 @@ __all__ = [
     "ProbabilisticEnsembleControl",
     "RandomAgent",
     "RecedingHorizonSynthesis",
+    "RecurrentPQN",
+    "RecurrentQSARSA",
+    "RecurrentSAC",
+    "RecurrentSarsaLoss",
     "RegulatorSynthesis",
     "SB3Agent",
     "SystemIdentification",
@@ -48,3 +67,16 @@ __all__ = [
     "register_agent",
     "with_log_probs",
 ]
+
+_RECURRENT = ("DRQN", "R2D2", "RecurrentPQN", "RecurrentQSARSA", "RecurrentSAC", "RecurrentSarsaLoss")
+
+
+def __getattr__(name: str) -> Any:
+    """The recurrent agents, which bring TorchRL with them, when they are asked for."""
+    if name in _RECURRENT:
+        return getattr(import_module("beliefgym.agents.recurrent"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_RECURRENT})

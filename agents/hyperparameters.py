@@ -12,7 +12,10 @@ environment. An agent with stacked frames, or on beliefs, takes the settings of 
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 _RECURRENT = {
     "policy": "MlpLstmPolicy",
@@ -141,9 +144,28 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
+# points of a grid in each component of continuous actions, for agents that choose among finitely many
+ACTION_BINS: dict[str, int | None] = {
+    "": None,  # discrete actions
+    "Pendulum": 9,
+    **dict.fromkeys(("CartPoleSwingUp", "DoublePendulum", "InvertedPendulum", "MobileBase", "Swimmer"), 5),
+    **dict.fromkeys(("Helicopter", "Quadrotor", "Baxter", "Mico", "Hopper", "Walker2d", "HalfCheetah"), 3),
+}
+
+
+def action_bins(env_id: str) -> dict[str, Any]:
+    """The option `bins` of agents with discrete actions on an environment; nothing where its actions are discrete."""
+    bins = _fitting(ACTION_BINS, env_id)
+    return {} if bins is None else {"bins": bins}
+
+
 def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
     """Constructor arguments of `SB3Agent` for an algorithm on an environment: the longest key that fits."""
     table = HYPERPARAMETERS.get(algorithm, {"": {"arguments": {"policy": "MlpPolicy"}}})
+    return {"algorithm": algorithm, **_fitting(table, env_id)}
+
+
+def _fitting(table: Mapping[str, T], env_id: str) -> T:
+    """The value of the longest key that the environment's name begins with."""
     name = env_id.rpartition("/")[2]
-    key = max((key for key in table if name.startswith(key)), key=len)
-    return {"algorithm": algorithm, **table[key]}
+    return table[max((key for key in table if name.startswith(key)), key=len)]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefgym.agents.agent import HEADER, Agent, read_archive
-from beliefgym.agents.hyperparameters import hyperparameters
+from beliefgym.agents.hyperparameters import action_bins, hyperparameters
 from beliefgym.wrappers.task import Task
 
 GROUP = "beliefgym.agents"
@@ -166,8 +166,13 @@ def _delays(env_id: str) -> dict[str, Any]:
     return {"delays": 2} if env_id.rpartition("-v")[0].endswith("Position") else {}
 
 
+def _recurrent_q(env_id: str) -> dict[str, Any]:
+    return {**action_bins(env_id), "auxiliary": {"predictive_state": {"weight": 1.0, "k": 5}}}
+
+
 _SB3 = "beliefgym.agents.sb3_agent:SB3Agent"
 _BELIEF = "beliefgym.agents.belief_policy:BeliefPolicy"
+_RECURRENT = "beliefgym.agents.recurrent"
 _LEARNED = {
     "psim": "a predictive state of observations alone",
     "psim-actions": "a predictive state with actions",
@@ -199,6 +204,25 @@ for _spec in (
         "pets",
         "beliefgym.agents.probabilistic_ensemble:ProbabilisticEnsembleControl",
         "model-based rival: ensemble of probabilistic networks, trajectory sampling, cross-entropy planning",
+    ),
+    AgentSpec(
+        "recurrent-q",
+        f"{_RECURRENT}:RecurrentQSARSA",
+        "Recurrent-Q SARSA (LSTM) with a predictive-state objective",
+        _recurrent_q,
+    ),
+    AgentSpec("drqn", f"{_RECURRENT}:DRQN", "recurrent Q-learning from a replay of episodes", action_bins),
+    AgentSpec(
+        "r2d2", f"{_RECURRENT}:R2D2", "recurrent Q-learning from stored states, with burn-in", action_bins
+    ),
+    AgentSpec(
+        "recurrent-pqn",
+        f"{_RECURRENT}:RecurrentPQN",
+        "recurrent Q-learning with lambda-returns, neither replay nor target network",
+        action_bins,
+    ),
+    AgentSpec(
+        "recurrent-sac", f"{_RECURRENT}:RecurrentSAC", "soft actor-critic with recurrent actor and critic"
     ),
     AgentSpec("recurrent-ppo", _SB3, "sb3-contrib's RecurrentPPO (LSTM)", _sb3("RecurrentPPO")),
     *(

@@ -21,6 +21,7 @@ BENCHMARKS = {
     "filter": "beliefgym.scripts.benchmarks.filter:run",
     "hints": "beliefgym.scripts.benchmarks.hints:run",
     "belief": "beliefgym.scripts.benchmarks.belief:run",
+    "recurrent": "beliefgym.scripts.benchmarks.recurrent:run",
 }
 
 
@@ -34,7 +35,7 @@ class Benchmark:
     """
 
     name: tyro.conf.Positional[str]
-    """Which: env, dad, control, filter, hints, belief."""
+    """Which: env, dad, control, filter, hints, belief, recurrent."""
     results: Path = Path("results")
     """Folder; NAME.json and NAME.md are written to its benchmark/."""
 

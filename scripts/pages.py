@@ -93,10 +93,18 @@ def strip(env_id: str, moments: tuple[float, ...] = (0.0, 0.25, 1.0)) -> NDArray
 
     Args:
         env_id: of the environment.
-        moments: as shares of the time limit.
+        moments: as shares of the time limit, or of the episode where it ends before the last of them.
     """
     steps = gym.spec(env_id).max_episode_steps or 200
-    wanted = [round(moment * (steps - 1)) for moment in moments]
+    frames, length = _episode(env_id, [round(moment * (steps - 1)) for moment in moments])
+    if len(frames) < len(moments):
+        frames, _ = _episode(env_id, [round(moment * length) for moment in moments])
+    joined: NDArray[np.uint8] = np.concatenate(frames, axis=1)
+    return joined
+
+
+def _episode(env_id: str, wanted: list[int]) -> tuple[list[Any], int]:
+    """Pictures after these numbers of steps of an expert's episode, as far as it goes, and how many steps were made."""
     task = Task(env_id)
     env = task.make(render_mode="rgb_array")
     agent: Any = make_agent("expert", task, seed=0)
@@ -104,19 +112,16 @@ def strip(env_id: str, moments: tuple[float, ...] = (0.0, 0.25, 1.0)) -> NDArray
     observation, _ = env.reset(seed=3)
     frames: list[Any] = []
     state, start = None, np.ones(1, dtype=np.bool_)
-    for t in range(steps):
-        if t in wanted:
-            frames.append(env.render())
+    terminated, t = False, 0
+    while True:
+        frames += [env.render() for moment in wanted if moment == t]
+        if terminated or t >= max(wanted):
+            env.close()
+            return frames, t
         action, state = agent.predict(observation, state=state, episode_start=start, deterministic=True)
         start = np.zeros(1, dtype=np.bool_)
         observation, _, terminated, _, _ = env.step(action)
-        if terminated:
-            break
-    while len(frames) < len(wanted):
-        frames.append(env.render())
-    env.close()
-    joined: NDArray[np.uint8] = np.concatenate(frames, axis=1)
-    return joined
+        t += 1
 
 
 def mosaic(env_ids: list[str], columns: int = 6) -> NDArray[np.uint8]:

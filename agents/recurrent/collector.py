@@ -6,7 +6,6 @@ what is recorded, under "next" too, so that a network can be run over any piece 
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -18,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from beliefgym.agents.recurrent.network import HistoryEncoder
+from beliefgym.agents.recurrent.rolling import final_states
 
 
 class Seen(NamedTuple):
@@ -184,20 +184,13 @@ class _RunningEpisodes:
         self.lengths += 1
 
     def states(self, encoder: HistoryEncoder, state_size: int) -> Tensor:
-        """(n, state_size) after what was seen. All end together, so that the longest begins and others join it."""
-        order = np.argsort(-self.lengths, kind="stable")
-        lengths = self.lengths[order]
-        states = self._stores[0].new_zeros(len(order), state_size)
-        longest = int(lengths[0])
-        joins = sorted({longest - int(length) for length in lengths if length > 0} | {longest})
-        for begin, end in pairwise(joins):
-            n = int((lengths >= longest - begin).sum())  # those that have begun
-            rows = torch.from_numpy(order[:n])[:, None]
-            steps = torch.arange(begin, end) - torch.from_numpy(longest - lengths[:n])[:, None]
-            _, states[:n] = encoder(*(store[rows, steps] for store in self._stores), states[:n])
-        refreshed = torch.empty_like(states)
-        refreshed[torch.from_numpy(order)] = states
-        return refreshed
+        """(n, state_size) after what was seen."""
+        longest = int(self.lengths.max())
+        # row i's steps, moved so that all rows end together; what stands before them does not count
+        steps = torch.from_numpy(np.arange(longest) - longest + self.lengths[:, None]).clamp(min=0)
+        seen = tuple(store[torch.from_numpy(self._rows)[:, None], steps] for store in self._stores)
+        first = self._stores[0].new_zeros(len(self.lengths), state_size)
+        return final_states(encoder, seen, torch.from_numpy(self.lengths), first)
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:

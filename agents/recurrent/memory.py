@@ -1,13 +1,15 @@
 """What a network remembers: cells that run over whole pieces of episodes, with their state as one vector.
 
-A state (n, state_size) is h of a GRU, [h, c] of an LSTM, nothing where there is no memory. PyTorch's own layers run
-(on a processor its LSTM is the faster by far); a cell of one's own is a `Memory` with another `forward`.
+A state (n, state_size) is h of a GRU, [h, c] of an LSTM, the last inputs of a stack, nothing where there is no memory.
+PyTorch's own layers run (on a processor its LSTM is the faster by far); a cell of one's own is a `Memory` with another
+`forward`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -77,7 +79,39 @@ class NoMemory(Memory):
         return hidden, state
 
 
-MEMORIES: dict[str, Callable[[int, int], Memory]] = {"lstm": LSTM, "gru": GRU, "none": NoMemory}
+class Stack(Memory):
+    """No recurrence: `NoMemory` on the last n inputs (frames) side by side, zeros before an episode's start.
+
+    Args:
+        input_size, hidden_size: see `Memory`. n_frames: n, the present one among them.
+
+    Raises:
+        ValueError: fewer than 2 frames.
+
+    Reference: Mnih et al. 2015, the preprocessing phi of the last 4 frames.
+    """
+
+    def __init__(self, input_size: int, hidden_size: int, n_frames: int) -> None:
+        if n_frames < 2:
+            raise ValueError(f'expected a stack of at least 2 frames, got {n_frames}; "none" is that of 1')
+        super().__init__(input_size, hidden_size, (n_frames - 1) * input_size)
+        self.n_frames = n_frames
+        self.layer = NoMemory(n_frames * input_size, hidden_size)
+
+    def forward(self, inputs: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Memory.forward`; the state is the last n - 1 inputs, oldest first."""
+        frames = torch.cat([state.view(len(state), self.n_frames - 1, self.input_size), inputs], dim=1)
+        stacked = frames.unfold(1, self.n_frames, 1).transpose(2, 3).flatten(2)
+        hidden, _ = self.layer(stacked, state)
+        return hidden, frames[:, 1 - self.n_frames :].flatten(1)
+
+
+MEMORIES: dict[str, Callable[[int, int], Memory]] = {
+    "lstm": LSTM,
+    "gru": GRU,
+    "none": NoMemory,
+    **{f"stack{n}": partial(Stack, n_frames=n) for n in (2, 4, 8)},
+}
 
 
 def make_memory(cell: str | Callable[[int, int], Memory], input_size: int, hidden_size: int) -> Memory:

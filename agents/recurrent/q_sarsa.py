@@ -14,7 +14,7 @@ by min(1, pi / mu) at each step; the proposal names that as an option. `average=
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict
@@ -22,9 +22,13 @@ from torchrl.objectives import SoftUpdate
 
 from beliefgym.agents.recurrent.auxiliary import make_auxiliary
 from beliefgym.agents.recurrent.collector import RolloutCollector
+from beliefgym.agents.recurrent.network import HISTORY_KEYS
 from beliefgym.agents.recurrent.q_agent import RecurrentQAgent
+from beliefgym.agents.recurrent.rolling import final_states
 from beliefgym.agents.recurrent.sarsa_loss import Bootstrap, Gradient, RecurrentSarsaLoss
 from beliefgym.wrappers.task import Task
+
+Refresh = Literal["all", "running", "none"]
 
 
 class RecurrentQSARSA(RecurrentQAgent):
@@ -36,7 +40,8 @@ class RecurrentQSARSA(RecurrentQAgent):
         n_batches: gradient steps after each rollout; together they go once through what is kept.
         average: the share that stays of the averaged network at each gradient step; 0 for no average.
         bootstrap, gradient, n_steps, weights: see `RecurrentSarsaLoss`.
-        refresh: False carries hidden states on from one rollout to the next, though the network has changed.
+        refresh: which hidden states are rolled anew when the network has changed: "all", those of running episodes and
+            those that kept rollouts begin with; "running"; or "none", where states are carried on.
         auxiliary: objectives by name with their options: "weight" (lambda; "linear:0.5" falls to 0), "k", "on_hidden".
 
     Raises:
@@ -60,7 +65,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         gradient: Gradient = "semi",
         n_steps: int | None = None,
         weights: float | list[float] = 0.9,
-        refresh: bool = True,
+        refresh: Refresh = "all",
         temperature: float = 0.05,
         auxiliary: Mapping[str, Mapping[str, Any]] | None = None,
         **shared: Any,
@@ -78,6 +83,8 @@ class RecurrentQSARSA(RecurrentQAgent):
         }
         if reuse < 1 or n_batches < 1:
             raise ValueError(f"expected reuse and n_batches of at least 1, got {reuse} and {n_batches}")
+        if refresh not in ("all", "running", "none"):
+            raise ValueError(f'expected refresh "all", "running" or "none", got {refresh!r}')
         if reuse > 1 and bootstrap == "taken":
             raise ValueError(
                 "rollouts of older policies (reuse > 1) show what those did next, not this policy: take "
@@ -115,7 +122,9 @@ class RecurrentQSARSA(RecurrentQAgent):
 
     def before_rollout(self, collector: RolloutCollector) -> dict[str, Any]:
         """Roll the hidden states of running episodes anew with the network that will act."""
-        return {"state_drift": collector.refresh(self.acting.encoder)} if self._own["refresh"] else {}
+        if self._own["refresh"] == "none":
+            return {}
+        return {"state_drift": collector.refresh(self.acting.encoder)}
 
     def improve(self, rollout: TensorDict, progress: float) -> dict[str, Any]:
         """Fit Q to the rollouts that are kept; see `RecurrentQAgent.improve`."""
@@ -126,6 +135,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         self._rollouts = (
             [*self._rollouts[-(self._own["reuse"] - 1) :], rollout] if self._own["reuse"] > 1 else [rollout]
         )
+        told = {"kept_state_drift": self._refresh_kept()} if self._own["refresh"] == "all" else {}
         rows = torch.cat(self._rollouts) if len(self._rollouts) > 1 else rollout
         order = torch.randperm(len(rows), generator=self._random)
         for chosen in order.chunk(self._own["n_batches"]):
@@ -133,7 +143,30 @@ class RecurrentQSARSA(RecurrentQAgent):
             if self._average is not None:
                 self._average.step()
         self.sync_acting()
-        return {key: float(value) for key, value in answer.items()}
+        return told | {key: float(value) for key, value in answer.items()}
+
+    def _refresh_kept(self) -> float:
+        """The states that kept rollouts begin with, as the acting network would have come to them; how far off they
+        were.
+
+        Rollouts follow one another, so that the state after one is the state before the next. What the oldest begins
+        with stays.
+        """
+        state = self._rollouts[0]["recurrent_state"][:, 0].clone()
+        difference = size = 0.0
+        for rollout in self._rollouts:
+            held = rollout["recurrent_state"]
+            difference += float((held[:, 0] - state).square().sum())
+            size += float(state.square().sum())
+            held[:, 0] = state
+            n_steps = rollout.shape[1]
+            is_init = rollout["is_init"][..., 0]
+            begins = torch.where(is_init, torch.arange(n_steps), -1).max(dim=1).values
+            first = torch.where((begins < 0)[:, None], state, 0.0)
+            inputs = tuple(rollout[key] for key in HISTORY_KEYS)
+            state = final_states(self.acting.encoder, inputs, n_steps - begins.clamp(min=0), first)
+            state = state * (~rollout["next", "done"][:, -1]).to(state.dtype)
+        return (difference / size) ** 0.5 if size > 0.0 else 0.0
 
     def options(self) -> dict[str, Any]:
         """See `Agent.options`."""

@@ -63,7 +63,7 @@ def run(request: Request) -> Report:
 
 
 def outcome(trial: Trial, n: int, seed: int) -> Outcome:
-    """Run an expert in n copies for one whole episode.
+    """Run an expert in n copies for one whole episode, or for the trial's steps.
 
     Args:
         trial: the task.
@@ -75,7 +75,7 @@ def outcome(trial: Trial, n: int, seed: int) -> Outcome:
     system: System = env.unwrapped.system  # type: ignore[attr-defined]
     expert: Any = make_agent("expert", task, seed=0)
     expert.set_env(env)
-    steps = gym.spec(trial.env_id).max_episode_steps
+    steps = trial.steps or gym.spec(trial.env_id).max_episode_steps
     assert steps is not None
     last_second = max(1, round(1.0 / system.dt))
     observation, _ = env.reset(seed=seed)

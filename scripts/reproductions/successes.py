@@ -82,6 +82,13 @@ def _joint_error_at_the_end(system: Any, states: Floats) -> Floats:
     return error
 
 
+def _arm_missed_at_the_end(system: Any, states: Floats) -> Floats:
+    """0 in the arm that the cue named, 1 in none, 2 in the other one, in the last state."""
+    cue, arm = np.moveaxis(_columns(system, states, "cue", "arm")[-1], -1, 0)
+    missed: Floats = 1.0 - cue * arm
+    return missed
+
+
 def _hand_error_at_the_end(system: Any, states: Floats) -> Floats:
     """How far the hand is from its target in the last state."""
     seen = system.observe(states[-1])
@@ -108,11 +115,13 @@ class Trial:
         env_id: of the environment.
         success: the criterion.
         parameters: of the system, where they differ from the registered ones.
+        steps: after which success is judged; the time limit by default. A task that ends when it is done has them.
     """
 
     env_id: str
     success: Success
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    steps: int | None = None
 
     @property
     def label(self) -> str:
@@ -176,5 +185,10 @@ TRIALS: tuple[Trial, ...] = (
             0.2,
             "rad",
         ),
+    ),
+    Trial(
+        "beliefgym/TMaze-v0",
+        Success("in the arm that the cue named after 11 steps", _arm_missed_at_the_end, 0.5, "arms"),
+        steps=11,
     ),
 )

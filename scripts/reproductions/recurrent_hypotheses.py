@@ -1,0 +1,209 @@
+"""`beliefgym reproduce recurrent-hypotheses`: is SARSA right for recurrent Q, and what should its state predict? (H5
+to H7)
+
+    H5 "SARSA is a suitable algorithm for recurrent-Q architectures."
+    H6 "Predictive state statistics can help training of recurrent-Q networks on partially observed systems."
+    H7 "A belief over statistics of future rewards may be sufficient hidden state for fitting Q functions."
+                                                                                     (thesis proposal, Sec. 4.3)
+
+Every method of recurrent_methods.py on every task there, with the same steps and seeds. A claim is a difference of test
+returns between two methods, paired by seeds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from beliefgym.agents import find_agent
+from beliefgym.scripts.reproductions.cells import run_cells
+from beliefgym.scripts.reproductions.dad_figures import STYLE, plain, save
+from beliefgym.scripts.reproductions.recurrent_methods import (
+    CURVE_EPISODES,
+    H5,
+    H6,
+    H7,
+    METHODS,
+    SETTINGS,
+    TEST_EPISODES,
+)
+from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
+
+Found = dict[tuple[str, str], dict[int, dict[str, Any]]]  # (task, method) -> seed -> result
+NAME = "recurrent-hypotheses"
+VERSION = 1  # of the protocol
+PLAIN = "SARSA"
+RIVALS = ("DRQN, random", "DRQN, sequential", "R2D2", "PQN", "SARSA, stack of 4", "DQN, stack of 4")
+CLAIMS: tuple[tuple[str, str, str], ...] = (
+    *(("H5", PLAIN, rival) for rival in RIVALS),
+    *(("H5", PLAIN, other) for other in H5 if other.startswith("SARSA, ") and other not in RIVALS),
+    *(("H6", name, PLAIN) for name in H6),
+    *(("H7", name, PLAIN) for name in H7),
+    *(("H7", name, "predictive state") for name in H7),
+)
+COLUMNS = (
+    "what",
+    "return",
+    "best",
+    "solved",
+    "kept",
+    "state off",
+    "R2 of state",
+    "minutes",
+    "difference",
+    "meets",
+)
+ABOUT = (
+    f"Returns of {TEST_EPISODES} test episodes after training (`return`), the best of 20 evaluations of "
+    f"{CURVE_EPISODES} validation episodes on the way (`best`) and what of it, from the random policy's return on, is "
+    "left at the end (`kept`); of tasks with a solution, the seeds whose evaluation reached it before a quarter of the "
+    "steps and held it at the end (`solved`); how far the hidden states learned from were off, relative to those of "
+    "the present network (`state off`); linear decodability of the full observation from the hidden state; training time. "
+    "Means over seeds with 95 % intervals. Rows `X over Y`: difference of test returns, paired by seeds; `meets`: the "
+    "interval lies above 0."
+)
+
+
+def run(request: Request) -> Report:
+    """All tasks, methods and seeds; what has been run is not run again."""
+    seeds = range(request.seed, request.seed + request.seeds)
+    cells = {
+        f"{task}--{_slug(method)}--{seed}": _cell(task, method, seed)
+        for seed in seeds
+        for task in SETTINGS
+        for method in METHODS
+    }
+    done = run_cells(
+        "beliefgym.scripts.reproductions.recurrent_methods:cell",
+        cells,
+        request.folder / "cells" / NAME,
+        request.jobs,
+        request.told,
+    )
+    found: Found = {}
+    failed = []
+    for name, result in done.items():
+        cell = cells[name]
+        if "failed" in result:
+            failed.append(f"Failed: {name}: {result['failed']}")
+        else:
+            found.setdefault((cell["name"], cell["method"]), {})[cell["seed"]] = result
+    rows = [row for task in SETTINGS for row in _rows(task, found)]
+    path = request.folder / f"{NAME}.png"
+    figure(path, found)
+    configuration = {
+        "version": VERSION,
+        "tasks": {name: setting.task.to_dict() for name, setting in SETTINGS.items()},
+        "steps": {name: setting.steps for name, setting in SETTINGS.items()},
+        "methods": METHODS,
+    }
+    caption = "Returns on validation episodes over environment steps: medians over seeds, and the range of all seeds."
+    return Report(ABOUT, COLUMNS, rows, configuration, {path.name: caption}, failed)
+
+
+def _cell(task: str, method: str, seed: int) -> dict[str, Any]:
+    setting = SETTINGS[task]
+    agent, options = METHODS[method]
+    registered = find_agent(agent).options(setting.task.env_id)
+    return {
+        "version": VERSION,
+        "name": task,
+        "method": method,
+        "task": setting.task.to_dict(),
+        "steps": setting.steps,
+        "agent": agent,
+        "options": {**registered, **setting.options, **options},
+        "seed": seed,
+    }
+
+
+def _slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in text.lower()).replace("--", "-")
+
+
+def _rows(task: str, found: Found) -> list[Row]:
+    rows: list[Row] = []
+    for method in METHODS:
+        results = list(found.get((task, method), {}).values())
+        if results:
+            rows.append(_row(task, method, results))
+    for hypothesis, better, worse in CLAIMS:
+        ours, theirs = found.get((task, better), {}), found.get((task, worse), {})
+        both = sorted(set(ours) & set(theirs))
+        if both:
+            gap = Interval.of([np.mean(ours[s]["returns"]) - np.mean(theirs[s]["returns"]) for s in both])
+            rows.append(
+                {
+                    "what": f"{SETTINGS[task].title}, {hypothesis}: {better} over {worse}",
+                    "difference": gap.text(".3g"),
+                    "meets": bool(gap.low > 0.0) if gap.n > 1 else None,
+                    "values": {"difference": gap.to_dict()},
+                }
+            )
+    return rows
+
+
+def _row(task: str, method: str, results: list[dict[str, Any]]) -> Row:
+    setting = SETTINGS[task]
+    final = Interval.of([np.mean(one["returns"]) for one in results])
+    curves = [[point["mean_return"] for point in one["curve"]] for one in results]
+    best = Interval.of([max(curve) for curve in curves])
+    kept = Interval.of(
+        [
+            (np.mean(one["returns"]) - c[0]) / max(max(c) - c[0], 1e-9)
+            for one, c in zip(results, curves, strict=True)
+        ]
+    )
+    off = [max(one["drifts"].values()) for one in results if one["drifts"]]
+    told = [float(np.mean(list(one["decodability"].values()))) for one in results if one["decodability"]]
+    minutes = Interval.of([one["seconds"] / 60 for one in results])
+    row: Row = {
+        "what": f"{setting.title}: {method}",
+        "return": final.text(".4g"),
+        "best": best.text(".4g"),
+        "kept": kept.text(".2f"),
+        "minutes": f"{minutes.mean:.1f}",
+        "meets": None,
+        "values": {"return": final.to_dict(), "best": best.to_dict(), "kept": kept.to_dict()},
+    }
+    if setting.best is not None:
+        quarter = [
+            any(p["mean_return"] >= setting.best and p["step"] <= setting.steps / 4 for p in one["curve"])
+            and float(np.mean(one["returns"])) >= setting.best
+            for one in results
+        ]
+        row["solved"] = f"{sum(quarter)} of {len(quarter)}"
+    if off:
+        row["state off"] = f"{float(np.mean(off)):.3f}"
+    if told:
+        row["R2 of state"] = Interval.of(told).text(".2f")
+    return row
+
+
+def figure(path: Path, found: Found) -> None:
+    """A row of panels for each hypothesis: learning curves on every task."""
+    shown = [task for task in SETTINGS if any(key[0] == task for key in found)]
+    if not shown:
+        return
+    groups = {"H5": list(H5), "H6 and H7": [PLAIN, *H6, *H7]}
+    colours = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]
+    with matplotlib.rc_context(STYLE):
+        drawing = Figure(figsize=(3.4 * len(shown), 6.6), layout="constrained")
+        axes = drawing.subplots(2, len(shown), squeeze=False)
+        for line, (title, methods) in zip(axes, groups.items(), strict=True):
+            for ax, task in zip(line, shown, strict=True):
+                for colour, method in zip(colours, methods, strict=False):
+                    results = list(found.get((task, method), {}).values())
+                    if not results:
+                        continue
+                    steps = [point["step"] for point in results[0]["curve"]]
+                    values = np.array([[p["mean_return"] for p in one["curve"]] for one in results])
+                    ax.plot(steps, np.median(values, axis=0), color=colour, lw=1.4, label=method)
+                    ax.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.10, lw=0)
+                plain(ax, f"{title}: {SETTINGS[task].title}", "environment steps", "return")
+            line[0].legend(frameon=False, fontsize=6)
+        save(drawing, path)

@@ -1,0 +1,143 @@
+"""What `beliefgym reproduce recurrent-hypotheses` compares: tasks, methods, and one cell of their product.
+
+Every method of a hypothesis has the same network (an LSTM of 64 between layers of 64), the same copies and the same
+number of environment steps. Learning rates and the methods' own numbers are those that they are registered with.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from beliefgym.agents import evaluate, make_agent
+from beliefgym.scripts.reproductions.recurrent_decoding import decodability
+from beliefgym.scripts.training import LearningCurve
+from beliefgym.wrappers.task import Task
+
+TEST_SEED, TEST_EPISODES = 1_000_000, 100
+CURVE_POINTS, CURVE_EPISODES = 20, 20
+DECODING_SEED, DECODING_EPISODES = 5_000_000, 40
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A task of the comparison.
+
+    Args:
+        title: in figures. task: the task. steps: of training. best: the return that counts as solved; None for none.
+        options: constructor options of every agent here on this task (a grid of actions, a discount).
+    """
+
+    title: str
+    task: Task
+    steps: int
+    best: float | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def _cart_pole(suffix: str) -> Task:
+    return Task(f"beliefgym/CartPoleBalance{suffix}-v0")
+
+
+SETTINGS: dict[str, Setting] = {
+    "cart-pole": Setting("cart-pole, positions", _cart_pole("Position"), 200_000, 500.0),
+    "cart-pole-easy": Setting("cart-pole, noise 0.1", _cart_pole("NoisyEasy"), 200_000),
+    "cart-pole-medium": Setting("cart-pole, noise 0.2", _cart_pole("NoisyMedium"), 200_000),
+    "cart-pole-hard": Setting("cart-pole, noise 0.3", _cart_pole("NoisyHard"), 200_000),
+    "pendulum": Setting(
+        "pendulum, position", Task("beliefgym/PendulumPosition-v0"), 100_000, -200.0, {"bins": 9}
+    ),
+    "acrobot": Setting(
+        "acrobot, positions",
+        Task("Acrobot-v1", {}, (("PartialObservation", {"keep": [0, 1, 2, 3]}),)),
+        100_000,
+        -100.0,
+    ),
+    "swing-up": Setting(
+        "cart-pole swing-up, positions",
+        Task("beliefgym/CartPoleSwingUpPosition-v0"),
+        100_000,
+        None,
+        {"bins": 5},
+    ),
+    "t-maze": Setting("T-maze", Task("beliefgym/TMazeMemory-v0"), 100_000, 4.0),
+}
+_PREDICTIVE = {"predictive_state": {"weight": 1.0, "k": 5}}
+LETTER: dict[str, Any] = {  # the thesis proposal's algorithm: one rollout, both sides, arg max
+    "reuse": 1,
+    "average": 0.0,
+    "temperature": 0.0,
+    "bootstrap": "taken",
+    "gradient": "residual",
+    "n_steps": 4,
+}
+SEMI = {**LETTER, "gradient": "semi"}
+
+# name -> (agent, options)
+H5: dict[str, tuple[str, dict[str, Any]]] = {
+    "SARSA": ("recurrent-q", {"auxiliary": {}}),
+    "SARSA, to the letter": ("recurrent-q", {"auxiliary": {}, **LETTER}),
+    "SARSA, one rollout, semi-gradient": ("recurrent-q", {"auxiliary": {}, **SEMI}),
+    "SARSA, states carried on": ("recurrent-q", {"auxiliary": {}, "refresh": "none"}),
+    "DRQN, random": ("drqn", {}),
+    "DRQN, sequential": ("drqn", {"updates": "sequential"}),
+    "R2D2": ("r2d2", {}),
+    "PQN": ("recurrent-pqn", {}),
+    "SARSA, stack of 4": ("recurrent-q", {"auxiliary": {}, "cell": "stack4"}),
+    "DQN, stack of 4": ("drqn", {"cell": "stack4", "burn_in": 3}),
+}
+H6: dict[str, tuple[str, dict[str, Any]]] = {
+    "predictive state": ("recurrent-q", {"auxiliary": _PREDICTIVE}),
+    "predictive state, falling": (
+        "recurrent-q",
+        {"auxiliary": {"predictive_state": {"weight": "linear:1.0", "k": 5}}},
+    ),
+    "predictive state, h itself": (
+        "recurrent-q",
+        {"auxiliary": {"predictive_state": {"weight": 1.0, "k": 5, "on_hidden": True}}},
+    ),
+    "dynamics": ("recurrent-q", {"auxiliary": {"dynamics": {"weight": 1.0}}}),
+    "latent self-prediction": ("recurrent-q", {"auxiliary": {"latent_self_prediction": {"weight": 1.0}}}),
+}
+H7: dict[str, tuple[str, dict[str, Any]]] = {
+    "predictive rewards": ("recurrent-q", {"auxiliary": {"predictive_rewards": {"weight": 1.0, "k": 5}}}),
+    "predictive rewards, h itself": (
+        "recurrent-q",
+        {"auxiliary": {"predictive_rewards": {"weight": 1.0, "k": 5, "on_hidden": True}}},
+    ),
+    "predictive values": ("recurrent-q", {"auxiliary": {"predictive_values": {"weight": 1.0, "k": 5}}}),
+}
+METHODS = {**H5, **H6, **H7}
+
+
+def cell(cell: dict[str, Any], _: Any) -> dict[str, Any]:
+    """Train one method on one task with one seed.
+
+    Returns:
+        `curve` of validation returns, `returns` of test episodes, `history` (how far hidden states were off, mean of
+        the training), `decodability`, `seconds`.
+    """
+    torch.set_num_threads(1)
+    task = Task.from_dict(cell["task"])
+    agent = make_agent(cell["agent"], task, seed=cell["seed"], **cell["options"])
+    learning = LearningCurve(agent, task, cell["steps"], CURVE_POINTS, CURVE_EPISODES)
+    began = time.perf_counter()
+    learning.train()
+    seconds = time.perf_counter() - began
+    history: list[dict[str, Any]] = getattr(agent, "history", [])
+    drifts = {
+        name: float(np.mean([one[name] for one in history if name in one]))
+        for name in ("state_drift", "kept_state_drift")
+        if any(name in one for one in history)
+    }
+    return {
+        "curve": learning.curve,
+        "returns": evaluate(agent, task, TEST_EPISODES, seed=TEST_SEED).returns.tolist(),
+        "drifts": drifts,
+        "decodability": decodability(agent, task, DECODING_EPISODES, DECODING_SEED),
+        "seconds": seconds,
+    }
