@@ -59,12 +59,12 @@ COLUMNS = (
 )
 ABOUT = (
     f"Returns of {TEST_EPISODES} test episodes after training (`return`), the best of 20 evaluations of "
-    f"{CURVE_EPISODES} validation episodes on the way (`best`) and what of it, from the random policy's return on, is "
-    "left at the end (`kept`); of tasks with a solution, the seeds whose evaluation reached it before a quarter of the "
-    "steps and held it at the end (`solved`); how far the hidden states learned from were off, relative to those of "
-    "the present network (`state off`); linear decodability of the full observation from the hidden state; training time. "
-    "Means over seeds with 95 % intervals. Rows `X over Y`: difference of test returns, paired by seeds; `meets`: the "
-    "interval lies above 0."
+    f"{CURVE_EPISODES} validation episodes on the way (`best`) and what of it, from the random policy's return on, "
+    "is left at the end (`kept`); of tasks with a solution, the seeds whose evaluation reached it before a quarter "
+    "of the steps and held it at the end (`solved`); how far the hidden states learned from were off, relative to "
+    "those of the present network (`state off`); linear decodability of the full observation from the hidden state; "
+    "training time in minutes. Means over seeds with 95 % intervals. Rows `X over Y`: difference of test returns, "
+    "paired by seeds; `meets`: the interval lies above 0."
 )
 
 
