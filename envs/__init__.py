@@ -33,6 +33,7 @@ from beliefgym.envs.quadrotor import Quadrotor
 from beliefgym.envs.registration import register_composed, register_system, registered_ids
 from beliefgym.envs.simulation import NonFiniteError
 from beliefgym.envs.system import System
+from beliefgym.envs.t_maze import TMaze
 from beliefgym.envs.true_state import TrueState
 from beliefgym.envs.vector_env import SystemVectorEnv
 
@@ -69,6 +70,7 @@ __all__ = [
     "System",
     "SystemEnv",
     "SystemVectorEnv",
+    "TMaze",
     "TrueState",
     "UnscentedKalmanFilter",
     "Walker2dEnv",

@@ -20,6 +20,7 @@ def register_all() -> None:
     _mobile_base()
     _arms()
     _locomotion()
+    _t_maze()
 
 
 def _pendulums() -> None:
@@ -181,4 +182,17 @@ def _locomotion() -> None:
             layers=[("PartialObservation", {"keep": ["qpos_*"]})],
             parameters={"shown": ["qpos_*"]},
             max_episode_steps=1000,
+        )
+
+
+def _t_maze() -> None:
+    """The T-maze with everything in view, and with the cue at the start only; the steps are five times the length."""
+    memory = ["at_start", "in_corridor", "at_junction", "cue_seen"]
+    for suffix, shown in {"": {}, "Memory": {"components": memory}}.items():
+        register_composed(
+            f"TMaze{suffix}",
+            system="beliefgym.envs.t_maze:TMaze",
+            layers=[("DiscreteActions", {"bins": 3})],
+            parameters=shown,
+            max_episode_steps=50,
         )

@@ -184,6 +184,12 @@ class Simulation:
                     f"{', '.join(system.state_names[start : start + 4])}, got norm {norm[copy]:g}; divide it by "
                     "its norm"
                 )
+        nearest = np.asarray(system.project(states))
+        for copy, component in np.argwhere(np.abs(states - nearest) > 1e-6):
+            raise ValueError(
+                f"{self.name}: impossible start state of copy {copy}: the nearest possible "
+                f"{system.state_names[component]!r} is {nearest[copy, component]:g}, got {states[copy, component]:g}"
+            )
         for copy in np.flatnonzero(np.asarray(system.terminated(states))):
             raise ValueError(
                 f"{self.name}: impossible start state of copy {copy}: the episode would already be over there "

@@ -124,7 +124,7 @@ def _episode(env_id: str, wanted: list[int]) -> tuple[list[Any], int]:
         t += 1
 
 
-def mosaic(env_ids: list[str], columns: int = 6) -> NDArray[np.uint8]:
+def mosaic(env_ids: list[str], columns: int = 5) -> NDArray[np.uint8]:
     """The scenes of many environments in rows, without their panels: (height, width, 3)."""
     scenes = []
     for env_id in env_ids:

@@ -38,6 +38,7 @@ PEERS = {
     "MobileBase": "MountainCarContinuous-v0",
     "Baxter": "Pusher-v5",
     "Mico": "Pusher-v5",
+    "TMaze": "FrozenLake-v1",
     "HopperPosition": "Hopper-v5",
     "Walker2dPosition": "Walker2d-v5",
     "HalfCheetahPosition": "HalfCheetah-v5",

@@ -1,5 +1,8 @@
 """The pages of the environments say what the code and the results say."""
 
+from itertools import pairwise
+
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -41,6 +44,14 @@ def test_a_page_holds_picture_table_and_data_sheet(tmp_path, monkeypatch):
     picture = Image.open(tmp_path / "docs" / "images" / "environments" / "Pendulum.png")
     assert picture.width == pages.WIDTH
     assert "[Pendulum](Pendulum.md)" in (tmp_path / "docs" / "environments" / "README.md").read_text()
+
+
+def test_the_moments_of_a_short_episode_are_its_own():
+    """The expert leaves the T-maze after 11 of 50 steps: the start, a place on the way and the end are shown."""
+    picture = pages.strip(pages.shown_id(["beliefgym/TMaze-v0", "beliefgym/TMazeMemory-v0"]))
+    frames = np.split(picture, 3, axis=1)
+    assert picture.shape == (480, 3 * 720, 3)
+    assert not any(np.array_equal(a, b) for a, b in pairwise(frames))
 
 
 def test_what_was_not_measured_is_said_to_be(tmp_path):
