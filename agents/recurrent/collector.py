@@ -128,6 +128,14 @@ class RolloutCollector:
         self._state = refreshed
         return drift
 
+    def rescale(self, reward_scale: float) -> float:
+        """Change `reward_scale`; rewards already seen follow. The factor between the scales."""
+        ratio = reward_scale / self.reward_scale
+        self.reward_scale = reward_scale
+        self._previous_reward *= ratio
+        self._past.scale_rewards(ratio)
+        return ratio
+
     def _advance(
         self, acted: Acted, reward: NDArray[np.float64], done: NDArray[np.bool_], observation: NDArray[Any]
     ) -> None:
@@ -182,6 +190,10 @@ class _RunningEpisodes:
         for store, value in zip(self._stores, seen[:3], strict=True):
             store[self._rows, self.lengths] = value
         self.lengths += 1
+
+    def scale_rewards(self, ratio: float) -> None:
+        """Multiply what was seen of rewards."""
+        self._stores[2] *= ratio
 
     def states(self, encoder: HistoryEncoder, state_size: int) -> Tensor:
         """(n, state_size) after what was seen."""

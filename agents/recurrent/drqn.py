@@ -9,9 +9,10 @@ inconsistency that the thesis proposal puts right. With `updates="random"` an up
 episode, from a zero state, and goes on for `unroll` steps; with "sequential" it goes from an episode's start to its
 end. `double` takes the maximum by the network itself and its value by the target network.
 
-Against the paper: RAdam in place of ADADELTA, a squared error without clipping, layer normalisation and duelling heads
-(the network is that of the other agents here). `cell="stack4", burn_in=3` is DQN on stacked frames: there every step
-learned from has its frames.
+Against the paper: a random update begins at any step that is kept as likely, where the paper draws the episode first
+(the many short episodes of early policies then outweigh the others); RAdam in place of ADADELTA; a longer unroll than
+10; layer normalisation and duelling heads (the network is that of the other agents here). So `cell="none", unroll=1`
+is DQN, and `cell="stack4", burn_in=3` is DQN on stacked frames, each step that is learned from with all its frames.
 
 References: Hausknecht and Stone 2015; van Hasselt et al. 2016 (double); Mnih et al. 2015 (DQN).
 """
@@ -39,8 +40,8 @@ class DRQN(RecurrentQAgent):
         task, seed: see `RecurrentQAgent`, which takes all further arguments.
         updates: "random" or "sequential", the paper's two bootstrapped updates.
         unroll: steps of a random update. burn_in: steps in front of them that bring up the state, without loss.
-        batch_size: episodes in a gradient step; None for 32 random updates or 4 sequential ones.
-        n_batches: gradient steps after each rollout.
+        batch_size: episodes in a gradient step; None for 16 of random updates, 4 of sequential ones.
+        n_batches: gradient steps after each rollout; None for 32 of random updates, 8 of sequential ones.
         capacity: steps that the replay keeps. learning_starts: steps in it before the first gradient step.
         target_update: see `target_updater`.
         double: double Q-learning.
@@ -58,14 +59,15 @@ class DRQN(RecurrentQAgent):
         seed: int = 0,
         *,
         updates: Updates = "random",
-        unroll: int = 10,
+        unroll: int = 20,
         burn_in: int = 0,
         batch_size: int | None = None,
-        n_batches: int = 16,
+        n_batches: int | None = None,
         capacity: int = 100_000,
         learning_starts: int = 1000,
-        target_update: float = 0.005,
+        target_update: float = 0.05,
         double: bool = False,
+        learning_rate: float | str = "linear:1e-3",
         **shared: Any,
     ) -> None:
         self._own: dict[str, Any] = {
@@ -83,14 +85,16 @@ class DRQN(RecurrentQAgent):
             raise ValueError(f'expected updates "random" or "sequential", got {updates!r}')
         if updates == "sequential" and burn_in > 0:
             raise ValueError('sequential updates begin with an episode: take burn_in=0, or updates="random"')
-        self._batch_size = batch_size or (32 if updates == "random" else 4)
-        if min(unroll, self._batch_size, n_batches) < 1 or burn_in < 0:
+        usual = (16, 32) if updates == "random" else (4, 8)
+        self._batch_size = usual[0] if batch_size is None else batch_size
+        self._n_batches = usual[1] if n_batches is None else n_batches
+        if min(unroll, self._batch_size, self._n_batches) < 1 or burn_in < 0:
             raise ValueError(
                 "expected unroll, batch_size and n_batches of at least 1 and burn_in of at least 0, got "
                 f"{unroll}, {batch_size}, {n_batches} and {burn_in}"
             )
         self._replay = EpisodeReplay(capacity)
-        super().__init__(task, seed, **shared)
+        super().__init__(task, seed, learning_rate=learning_rate, **shared)
         self._target = target_updater(self.loss, target_update)
 
     def make_loss(self) -> RecurrentSarsaLoss:
@@ -111,7 +115,7 @@ class DRQN(RecurrentQAgent):
         self._replay.extend(rollout.exclude("recurrent_state"))
         if len(self._replay) < self._own["learning_starts"]:
             return {}
-        for _ in range(self._own["n_batches"]):
+        for _ in range(self._n_batches):
             answer = self.step_optimizer(self.sample())
             self._target.step()
         self.sync_acting()

@@ -111,6 +111,7 @@ class RecurrentQAgent(Agent):
         self.num_timesteps = 0
         self.history: list[dict[str, Any]] = []
         self._reward_scale = None if reward_scale == "auto" else float(reward_scale)
+        self._largest_reward = 0.0
         self._collector: RolloutCollector | None = None
         self._told_reward: NDArray[Any] | None = None
         self._moments = _RunningMoments(self.observation_space.shape[0])  # type: ignore[index]
@@ -286,10 +287,10 @@ class RecurrentQAgent(Agent):
         if self._reward_scale is None:
             self._reward_scale = _natural_scale(rollout["next", "reward"], self.gamma)
         if collector.reward_scale != self._reward_scale:
-            ratio = self._reward_scale / collector.reward_scale
+            ratio = collector.rescale(self._reward_scale)
             for key in (("next", "reward"), ("next", "previous_reward"), "previous_reward"):
                 rollout[key] *= ratio
-            collector.reward_scale = self._reward_scale
+        self._largest_reward = max(self._largest_reward, float(rollout["next", "reward"].abs().max()))
         self._moments.add(rollout["observation"].flatten(0, 1).numpy())
         self._set_moments()
         self.loss.epsilon, self.loss.temperature = self.epsilon, self.temperature
@@ -350,7 +351,7 @@ class RecurrentQAgent(Agent):
 
     def _check_finite(self, answer: TensorDict, total: Any) -> None:
         largest = float(answer["largest_value"])
-        if np.isfinite(float(total)) and largest < 1e6:
+        if np.isfinite(float(total)) and largest < self._largest_sum():
             return
         raise DivergenceError(
             f"{type(self).__name__} on {self.task.label} has diverged at step {self.num_timesteps}: loss "
@@ -359,6 +360,10 @@ class RecurrentQAgent(Agent):
             "smaller max_grad_norm or gamma"
             + (', or gradient="semi"' if self.loss.gradient == "residual" else "")
         )
+
+    def _largest_sum(self) -> float:
+        """A hundred times what the largest reward so far can add up to, and at least 1000."""
+        return max(1000.0, 100.0 * self._largest_reward / max(1.0 - self.gamma, 1e-3))
 
     def _vec_env(self) -> Any:
         if self._grid is None:

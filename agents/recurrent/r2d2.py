@@ -50,16 +50,17 @@ class R2D2(RecurrentQAgent):
         task: Task | str,
         seed: int = 0,
         *,
-        sequence_length: int = 20,
-        burn_in: int = 10,
+        sequence_length: int = 40,
+        burn_in: int = 20,
         stride: int | None = None,
         zero_state: bool = False,
         n_steps: int = 5,
-        batch_size: int = 32,
-        n_batches: int = 16,
+        batch_size: int = 16,
+        n_batches: int = 32,
         capacity: int = 100_000,
         learning_starts: int = 1000,
-        target_update: float = 0.005,
+        target_update: float = 0.05,
+        learning_rate: float | str = "linear:1e-3",
         **shared: Any,
     ) -> None:
         self._own: dict[str, Any] = {
@@ -86,7 +87,7 @@ class R2D2(RecurrentQAgent):
                 f"never learned from, got {stride}"
             )
         self._replay = EpisodeReplay(capacity)
-        super().__init__(task, seed, **shared)
+        super().__init__(task, seed, learning_rate=learning_rate, **shared)
         self._target = target_updater(self.loss, target_update)
 
     def make_loss(self) -> RecurrentSarsaLoss:

@@ -83,11 +83,11 @@ class EpisodeReplay:
         Raises:
             ValueError: nothing to draw from, here and below.
         """
-        chosen = self._any_episodes(n, generator)
+        chosen, _ = self._drawn(torch.ones_like(self._begins), n, generator)
         return self._pieces(chosen, self._begins[chosen], self._ends[chosen])
 
     def windows(self, n: int, length: int, generator: torch.Generator, burn_in: int = 0) -> TensorDict:
-        """Random starts in random episodes, each episode as likely, and in it each step.
+        """Starts anywhere in episodes, each step as likely: an episode is as likely as it is long.
 
         Args:
             n: how many. length: steps from the start on, fewer where the episode ends before.
@@ -96,11 +96,9 @@ class EpisodeReplay:
         Returns:
             (n, up to burn_in + length steps).
         """
-        chosen = self._any_episodes(n, generator)
-        begins, ends = self._begins[chosen], self._ends[chosen]
-        share = torch.rand(n, generator=generator, dtype=torch.float64)
-        starts = begins + (share * (ends - begins)).long()
-        return self._pieces(chosen, torch.maximum(starts - burn_in, begins), starts + length)
+        chosen, steps = self._drawn(self._ends - self._begins, n, generator)
+        starts = self._begins[chosen] + steps
+        return self._pieces(chosen, torch.maximum(starts - burn_in, self._begins[chosen]), starts + length)
 
     def sequences(
         self, n: int, length: int, stride: int, generator: torch.Generator, burn_in: int = 0
@@ -117,13 +115,10 @@ class EpisodeReplay:
         Returns:
             (n, up to burn_in + length steps).
         """
-        self._require_episodes()
         lengths = self._ends - self._begins
         counts = 1 + (lengths - burn_in - 1).clamp(min=0) // stride
-        up_to = counts.cumsum(0)
-        drawn = torch.randint(int(up_to[-1]), (n,), generator=generator)
-        chosen = torch.searchsorted(up_to, drawn, right=True)
-        starts = self._begins[chosen] + (drawn - (up_to - counts)[chosen]) * stride
+        chosen, which = self._drawn(counts, n, generator)
+        starts = self._begins[chosen] + which * stride
         return self._pieces(chosen, starts, starts + burn_in + length)
 
     def _tabulate(self, rows: Tensor, begins: Tensor, n_steps: int) -> None:
@@ -136,9 +131,13 @@ class EpisodeReplay:
         kept = begins >= self._now - self._size
         self._rows, self._begins, self._ends = rows[kept], begins[kept], ends[kept]
 
-    def _any_episodes(self, n: int, generator: torch.Generator) -> Tensor:
+    def _drawn(self, counts: Tensor, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Of as many things in each episode, each as likely: the episode's number, and the thing's number in it."""
         self._require_episodes()
-        return torch.randint(self.n_episodes, (n,), generator=generator)
+        up_to = counts.cumsum(0)
+        drawn = torch.randint(int(up_to[-1]), (n,), generator=generator)
+        chosen = torch.searchsorted(up_to, drawn, right=True)
+        return chosen, drawn - (up_to - counts)[chosen]
 
     def _require_episodes(self) -> None:
         if self.n_episodes == 0:

@@ -19,9 +19,6 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
-from gymnasium.vector import VectorEnv
-from gymnasium.wrappers.vector import TransformAction
 from numpy.typing import NDArray
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
@@ -31,15 +28,16 @@ from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from beliefgym.agents.agent import Agent, episode_starts, require_box
+from beliefgym.agents.recurrent.action_units import ActionUnits
 from beliefgym.agents.recurrent.auxiliary import make_auxiliary
 from beliefgym.agents.recurrent.collector import Acted, RolloutCollector, Seen
 from beliefgym.agents.recurrent.memory import Memory
 from beliefgym.agents.recurrent.network import HistoryEncoder
 from beliefgym.agents.recurrent.q_agent import DivergenceError, Remembered, _natural_scale, _RunningMoments
 from beliefgym.agents.recurrent.q_sarsa import _annealed
+from beliefgym.agents.recurrent.replay import EpisodeReplay
 from beliefgym.agents.recurrent.sac_loss import RecurrentSACLoss
 from beliefgym.agents.recurrent.sac_networks import RecurrentActor, RecurrentCritic, squashed_gaussian
-from beliefgym.agents.recurrent.sequence_replay import SequenceReplay
 from beliefgym.agents.training_callback import TrainingCallback
 from beliefgym.wrappers.task import Task
 
@@ -56,7 +54,7 @@ class RecurrentSAC(Agent):
         cell, hidden_size: of both encoders, see `HistoryEncoder`. width: of all other layers.
         previous_actions, previous_rewards: what the networks are told besides observations. With rewards, `predict`
             has to be told them (`tell_reward`).
-        gamma: discount.
+        gamma: discount. trace_decay, importance: see `RecurrentSACLoss`.
         learning_rate: of heads and temperature, a number, or "linear:1e-3" for one that falls to 0.
         encoder_learning_rate: the same for the encoders; None for learning_rate / 30.
         max_grad_norm: the gradients of actor and critic are each scaled down to it.
@@ -96,6 +94,8 @@ class RecurrentSAC(Agent):
         previous_actions: bool = True,
         previous_rewards: bool = False,
         gamma: float = 0.99,
+        trace_decay: float = 0.9,
+        importance: bool = True,
         learning_rate: float | str = 1e-3,
         encoder_learning_rate: float | str | None = None,
         max_grad_norm: float = 10.0,
@@ -113,8 +113,8 @@ class RecurrentSAC(Agent):
     ) -> None:
         super().__init__(task, seed)
         self.n_observation = require_box(self.observation_space, type(self).__name__).shape[0]
-        self._low, self._high = self._action_bounds()
-        self.n_action = len(self._low)
+        self._units = ActionUnits(self.action_space, self.task, type(self).__name__)
+        self.n_action = self._units.n
         self._options: dict[str, Any] = {
             "n_envs": n_envs,
             "rollout_steps": rollout_steps,
@@ -124,6 +124,8 @@ class RecurrentSAC(Agent):
             "previous_actions": previous_actions,
             "previous_rewards": previous_rewards,
             "gamma": gamma,
+            "trace_decay": trace_decay,
+            "importance": importance,
             "learning_rate": learning_rate,
             "encoder_learning_rate": encoder_learning_rate,
             "max_grad_norm": max_grad_norm,
@@ -145,10 +147,11 @@ class RecurrentSAC(Agent):
         self.history: list[dict[str, Any]] = []
         self._reward_scale = None if reward_scale == "auto" else float(reward_scale)
         self._collector: RolloutCollector | None = None
-        self._replay = SequenceReplay(n_envs, buffer_size)
+        self._replay = EpisodeReplay(buffer_size)
         self._told_reward: NDArray[Any] | None = None
         self._moments = _RunningMoments(self.n_observation)
         self._random = torch.Generator().manual_seed(seed)
+        self._fed = 0  # steps that the replay was given
         self._owed = 0.0  # gradient steps, of which whole ones are taken
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -176,8 +179,8 @@ class RecurrentSAC(Agent):
         """
         called = TrainingCallback(self, callback, total_timesteps)
         if self._collector is None:
-            env = self.task.make_vec(self.n_envs)
-            self._collector = RolloutCollector(self._with_units(env), self.actor.state_size, self.seed)
+            env = self._units.around(self.task.make_vec(self.n_envs))
+            self._collector = RolloutCollector(env, self.actor.state_size, self.seed)
         end = self.num_timesteps + total_timesteps
         with tqdm(
             total=total_timesteps, desc=type(self).__name__, unit="step", disable=not progress_bar
@@ -206,7 +209,7 @@ class RecurrentSAC(Agent):
         starts = episode_starts(state, episode_start, len(observation))
         acted = self._act(self._seen(observation, state, starts), deterministic)
         memory = Remembered(acted.state, acted.action, torch.zeros(len(observation), 1))
-        action = self._in_units(acted.action.numpy())
+        action = self._units.to_box(acted.action.numpy())
         return (action[0] if single else action), memory
 
     def options(self) -> dict[str, Any]:
@@ -260,15 +263,23 @@ class RecurrentSAC(Agent):
             DivergenceError: losses or values that have diverged.
         """
         answer: TensorDict = self.loss(batch)
-        total = sum(value for key, value in answer.items() if key.startswith("loss_"))
-        self._check_finite(float(total), float(answer["largest_value"]))
+        total = torch.stack([value for key, value in answer.items() if key.startswith("loss_")]).sum()
+        self._check_finite(total.item(), answer["largest_value"].item())
         self.optimizer.zero_grad()
-        total.backward()  # type: ignore[union-attr]
+        total.backward()
         for network in (self.actor, self.critic):
             nn.utils.clip_grad_norm_(network.parameters(), self._options["max_grad_norm"])
         self.optimizer.step()
         self._average.step()
         return answer
+
+    def sample(self) -> TensorDict:
+        """Sequences to learn from, (batch_size, longest), see `EpisodeReplay`."""
+        own = self._options
+        n, length = own["batch_size"], own["sequence_length"]
+        if length is None:
+            return self._replay.episodes(n, self._random)
+        return self._replay.sequences(n, length, max(length // 2, 1), self._random, own["burn_in"])
 
     def _collect_and_improve(self, collector: RolloutCollector, left: int, progress: float) -> dict[str, Any]:
         self._set_learning_rates(progress)
@@ -277,27 +288,23 @@ class RecurrentSAC(Agent):
             for name, options in self._options["auxiliary"].items()
         }
         told: dict[str, Any] = {"state_drift": collector.refresh(self.actor.encoder)}
-        waiting = min(self._options["learning_starts"] - len(self._replay), left)
+        waiting = min(self._options["learning_starts"] - self._fed, left)
         n_steps = max(self.rollout_steps, -(-waiting // self.n_envs))
         uniform = self.num_timesteps < self._options["learning_starts"]
         rollout = collector.collect(self._act_uniformly if uniform else self._act, n_steps)
         self._scale_rewards(collector, rollout)
         self._moments.add(rollout["observation"].flatten(0, 1).numpy())
         self._set_moments()
-        self._replay.extend(rollout)
+        self._replay.extend(rollout.exclude("recurrent_state"))
         steps = self.n_envs * n_steps
-        self.num_timesteps += steps
+        self.num_timesteps, self._fed = self.num_timesteps + steps, self._fed + steps
         if waiting <= 0:
             self._owed += steps * self._options["updates_per_step"]
         answer: TensorDict | None = None
-        length = self._options["sequence_length"]
         for _ in range(int(self._owed)):
-            batch = self._replay.sample(
-                self._options["batch_size"], length and length + self._options["burn_in"], self._random
-            )
-            answer = self.step_optimizer(batch)
+            answer = self.step_optimizer(self.sample())
         self._owed %= 1.0
-        told |= {key: float(value) for key, value in answer.items()} if answer is not None else {}
+        told |= {key: value.item() for key, value in answer.items()} if answer is not None else {}
         record = {
             "steps": steps,
             "num_timesteps": self.num_timesteps,
@@ -392,6 +399,8 @@ class RecurrentSAC(Agent):
             self.actor,
             self.critic,
             gamma=self.gamma,
+            trace_decay=own["trace_decay"],
+            importance=own["importance"],
             target_entropy=-float(self.n_action) if entropy is None else float(entropy),
             initial_temperature=own["initial_temperature"],
             burn_in=own["burn_in"],
@@ -428,29 +437,6 @@ class RecurrentSAC(Agent):
             f"smaller learning_rate (now {self._options['learning_rate']}), max_grad_norm or gamma, or a larger "
             f"average (now {self._options['average']})"
         )
-
-    def _action_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        space, name = self.action_space, type(self).__name__
-        if not isinstance(space, Box) or len(space.shape) != 1:
-            raise ValueError(
-                f"{name} chooses continuous actions, a flat Box, but {self.task.label} has {space}: take "
-                "RecurrentQSARSA, which chooses among finitely many"
-            )
-        if not space.is_bounded():
-            raise ValueError(
-                f"{name} needs bounded actions, but {self.task.label} has {space}: put Gymnasium's RescaleAction or "
-                "ClipAction around the environment"
-            )
-        return space.low.astype(np.float64), space.high.astype(np.float64)
-
-    def _in_units(self, action: NDArray[Any]) -> NDArray[Any]:
-        """(n, n_action) in (-1, 1) -> in units of the Box."""
-        scaled = self._low + 0.5 * (action + 1.0) * (self._high - self._low)
-        return scaled.clip(self._low, self._high).astype(self.action_space.dtype)
-
-    def _with_units(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
-        unit = Box(-1.0, 1.0, (self.n_action,), np.float32)
-        return TransformAction(env, self._in_units, single_action_space=unit)
 
 
 def _flat(name: str, tensors: Any, copy: bool = True) -> dict[str, Tensor]:

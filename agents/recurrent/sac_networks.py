@@ -22,6 +22,7 @@ from torch.nn.functional import softplus
 from beliefgym.agents.recurrent.network import HistoryEncoder
 
 LOG_STD_RANGE = (-5.0, 2.0)  # of the Gaussian before it is squashed
+EDGE = 1e-6  # about how near to 1 a tanh comes in single precision before it is rounded to 1
 
 
 def squashed_gaussian(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -39,9 +40,22 @@ def squashed_gaussian(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Ten
         (..., n_action) in (-1, 1), and (...) log-densities.
     """
     u = mean + log_std.exp() * noise
+    return u.tanh(), _log_density(u, noise, log_std)
+
+
+def log_density(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """The log-density (...) of actions (..., n_action) in [-1, 1]; see `squashed_gaussian`.
+
+    Actions that were rounded to -1 or 1 are taken to lie `EDGE` inside.
+    """
+    u = action.clamp(EDGE - 1.0, 1.0 - EDGE).atanh()
+    return _log_density(u, (u - mean) * (-log_std).exp(), log_std)
+
+
+def _log_density(u: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
     gaussian = -0.5 * (noise.square() + math.log(2.0 * math.pi)) - log_std
     squash = 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
-    return u.tanh(), (gaussian - squash).sum(-1)
+    return (gaussian - squash).sum(-1)
 
 
 def _head(size: int, n_outputs: int, width: int) -> nn.Sequential:
