@@ -71,7 +71,7 @@ class AuxiliaryObjective(nn.Module, ABC):
         self.decoder = None if on_hidden else nn.Linear(hidden_size, target_size)
         for name in ("mean", "std"):
             self.register_buffer(name, torch.full((target_size,), float(name == "std")))
-        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("count", torch.zeros(target_size))
 
     @abstractmethod
     def targets(self, pieces: Pieces) -> tuple[Tensor, Tensor]:
@@ -96,10 +96,11 @@ class AuxiliaryObjective(nn.Module, ABC):
         total = weights.sum((0, 1)).clamp(min=1.0)
         mean = (targets * weights).sum((0, 1)) / total
         variance = ((targets - mean).square() * weights).sum((0, 1)) / total
-        self.count += 1
-        share = max(1.0 / float(self.count), 0.01)
+        there = weights.sum((0, 1)) > 0.0  # of a target that is far ahead a batch may hold none
+        self.count += there
+        share = torch.where(there, (1.0 / self.count.clamp(min=1.0)).clamp(min=0.01), 0.0)
         old = self.mean.clone()
-        self.mean.lerp_(mean, share)
+        self.mean.add_(share * (mean - old))
         spread = (1 - share) * (self.std.square() + (old - self.mean).square())
         spread += share * (variance + (mean - self.mean).square())
         self.std.copy_(spread.sqrt().clamp(min=1e-3))

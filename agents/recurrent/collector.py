@@ -128,13 +128,14 @@ class RolloutCollector:
         self._state = refreshed
         return drift
 
-    def rescale(self, reward_scale: float) -> float:
-        """Change `reward_scale`; rewards already seen follow. The factor between the scales."""
+    def rescale(self, reward_scale: float, rollout: TensorDict) -> None:
+        """Change `reward_scale`; what was seen of rewards follows, in a rollout too."""
         ratio = reward_scale / self.reward_scale
         self.reward_scale = reward_scale
-        self._previous_reward *= ratio
+        self._previous_reward = self._previous_reward * ratio
         self._past.scale_rewards(ratio)
-        return ratio
+        for key in ("previous_reward", ("next", "previous_reward"), ("next", "reward")):
+            rollout.set(key, rollout.get(key) * ratio)  # two of them are one tensor
 
     def _advance(
         self, acted: Acted, reward: NDArray[np.float64], done: NDArray[np.bool_], observation: NDArray[Any]

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from beliefgym.agents.recurrent.memory import Memory, make_memory
+from beliefgym.agents.recurrent.rolling import states_after_rows
 from beliefgym.agents.recurrent.segments import Segments
 
 HISTORY_KEYS = ("observation", "previous_action", "previous_reward")
@@ -111,7 +112,8 @@ class RecurrentQNetwork(TensorDictModuleBase):
     Reads "observation", "previous_action", "previous_reward", "recurrent_state" and "is_init"; writes "action_value",
     "hidden" and ("next", "recurrent_state"). Under TorchRL's `set_recurrent_mode` the batch is (n, n_steps) and the
     recurrent state that of the first step, with episodes that may begin anywhere (`is_init`); else it is (n,), one
-    step. Under it ("next", "recurrent_state") is the state after each row's last step, repeated along the row.
+    step. Under it ("next", "recurrent_state") is the state after each row's last step, repeated along the row; where
+    episodes begin inside rows it has no gradient.
 
     Args:
         encoder: the history's encoder. n_actions: number of actions. width: of the layer in the head.
@@ -147,13 +149,13 @@ class RecurrentQNetwork(TensorDictModuleBase):
         state = tensordict.get("recurrent_state")
         if not recurrent_mode():
             state = torch.where(is_init[..., None], 0.0, state)
-            flat = state.reshape(-1, self.state_size)
+            flat = state.reshape(state.shape[:-1].numel(), self.state_size)
             observation, action, reward = (x.reshape(len(flat), 1, -1) for x in seen)
             values, hidden, after = self.values(observation, action, reward, flat)
             shape = state.shape[:-1]
             tensordict.set("action_value", values.reshape(*shape, -1))
             tensordict.set("hidden", hidden.reshape(*shape, -1))
-            return tensordict.set(("next", "recurrent_state"), after.reshape(*shape, -1))
+            return tensordict.set(("next", "recurrent_state"), after.reshape(state.shape))
         if not is_init[:, 1:].any():  # every row lies within one episode
             first = torch.where(is_init[:, :1], 0.0, state[:, 0])
             values, hidden, after = self.values(*seen, first)
@@ -163,11 +165,9 @@ class RecurrentQNetwork(TensorDictModuleBase):
         pieces = Segments(is_init)
         first = torch.where(pieces.fresh[:, None], 0.0, state[:, 0][pieces.rows])
         observation, action, reward = (pieces.steps(x) for x in seen)
-        values, hidden, after = self.values(observation, action, reward, first)
+        values, hidden, _ = self.values(observation, action, reward, first)
         n, n_steps = is_init.shape
         tensordict.set("action_value", pieces.back(values).view(n, n_steps, -1))
         tensordict.set("hidden", pieces.back(hidden).view(n, n_steps, -1))
-        last = torch.zeros_like(state[:, 0]).index_copy(
-            0, pieces.rows, after
-        )  # the last piece of a row stays
+        last = states_after_rows(self.encoder, seen, is_init, state[:, 0])
         return tensordict.set(("next", "recurrent_state"), last[:, None].expand(n, n_steps, -1))

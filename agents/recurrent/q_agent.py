@@ -164,6 +164,7 @@ class RecurrentQAgent(Agent):
         called = TrainingCallback(self, callback, total_timesteps)
         if self._collector is None:
             self._collector = RolloutCollector(self._vec_env(), self.network.state_size, self.seed)
+            self._collector.reward_scale = self._reward_scale or 1.0
         a_rollout = self.n_envs * self.rollout_steps
         with tqdm(
             total=total_timesteps, desc=type(self).__name__, unit="step", disable=not progress_bar
@@ -287,9 +288,7 @@ class RecurrentQAgent(Agent):
         if self._reward_scale is None:
             self._reward_scale = _natural_scale(rollout["next", "reward"], self.gamma)
         if collector.reward_scale != self._reward_scale:
-            ratio = collector.rescale(self._reward_scale)
-            for key in (("next", "reward"), ("next", "previous_reward"), "previous_reward"):
-                rollout[key] *= ratio
+            collector.rescale(self._reward_scale, rollout)
         self._largest_reward = max(self._largest_reward, float(rollout["next", "reward"].abs().max()))
         self._moments.add(rollout["observation"].flatten(0, 1).numpy())
         self._set_moments()
@@ -311,6 +310,8 @@ class RecurrentQAgent(Agent):
     def _act(self, seen: Seen, epsilon: float, temperature: float) -> Acted:
         observation, action, reward = (x[:, None] for x in seen[:3])
         values, _, state = self.acting.values(observation, action, reward, seen.state)
+        if not values.isfinite().all():
+            self._tell_divergence(float("nan"), float(values.abs().max()))
         probabilities = action_probabilities(values[:, 0], epsilon, temperature)
         if epsilon == 0.0 and temperature == 0.0:
             action = probabilities.argmax(-1)
@@ -349,15 +350,16 @@ class RecurrentQAgent(Agent):
             self.loss.target_value_network_params["encoder", "mean"].copy_(mean)
             self.loss.target_value_network_params["encoder", "scale"].copy_(scale)
 
-    def _check_finite(self, answer: TensorDict, total: Any) -> None:
-        largest = float(answer["largest_value"])
-        if np.isfinite(float(total)) and largest < self._largest_sum():
-            return
+    def _check_finite(self, answer: TensorDict, total: Tensor) -> None:
+        loss, largest = float(total.detach()), float(answer["largest_value"])
+        if not np.isfinite(loss) or not largest < self._largest_sum():
+            self._tell_divergence(loss, largest)
+
+    def _tell_divergence(self, loss: float, largest: float) -> None:
         raise DivergenceError(
-            f"{type(self).__name__} on {self.task.label} has diverged at step {self.num_timesteps}: loss "
-            f"{float(total):.3g}, largest |Q| {largest:.3g} in units of scaled rewards (scale "
-            f"{self._reward_scale or 1.0:.3g}). Try a smaller learning_rate (now {self._options['learning_rate']}), a "
-            "smaller max_grad_norm or gamma"
+            f"{type(self).__name__} on {self.task.label} has diverged at step {self.num_timesteps}: loss {loss:.3g}, "
+            f"largest |Q| {largest:.3g} in units of scaled rewards (scale {self._reward_scale or 1.0:.3g}). Try a "
+            f"smaller learning_rate (now {self._options['learning_rate']}), a smaller max_grad_norm or gamma"
             + (', or gradient="semi"' if self.loss.gradient == "residual" else "")
         )
 

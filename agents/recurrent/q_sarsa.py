@@ -24,7 +24,7 @@ from beliefgym.agents.recurrent.auxiliary import make_auxiliary
 from beliefgym.agents.recurrent.collector import RolloutCollector
 from beliefgym.agents.recurrent.network import HISTORY_KEYS
 from beliefgym.agents.recurrent.q_agent import RecurrentQAgent
-from beliefgym.agents.recurrent.rolling import final_states
+from beliefgym.agents.recurrent.rolling import states_after_rows
 from beliefgym.agents.recurrent.sarsa_loss import Bootstrap, Gradient, RecurrentSarsaLoss
 from beliefgym.wrappers.task import Task
 
@@ -138,12 +138,12 @@ class RecurrentQSARSA(RecurrentQAgent):
         told = {"kept_state_drift": self._refresh_kept()} if self._own["refresh"] == "all" else {}
         rows = torch.cat(self._rollouts) if len(self._rollouts) > 1 else rollout
         order = torch.randperm(len(rows), generator=self._random)
-        for chosen in order.chunk(self._own["n_batches"]):
+        for chosen in order.tensor_split(min(self._own["n_batches"], len(rows))):
             answer = self.step_optimizer(rows[chosen])
             if self._average is not None:
                 self._average.step()
         self.sync_acting()
-        return told | {key: float(value) for key, value in answer.items()}
+        return told | {key: float(value.detach()) for key, value in answer.items()}
 
     def _refresh_kept(self) -> float:
         """The states that kept rollouts begin with, as the acting network would have come to them; how far off they
@@ -159,12 +159,8 @@ class RecurrentQSARSA(RecurrentQAgent):
             difference += float((held[:, 0] - state).square().sum())
             size += float(state.square().sum())
             held[:, 0] = state
-            n_steps = rollout.shape[1]
-            is_init = rollout["is_init"][..., 0]
-            begins = torch.where(is_init, torch.arange(n_steps), -1).max(dim=1).values
-            first = torch.where((begins < 0)[:, None], state, 0.0)
-            inputs = tuple(rollout[key] for key in HISTORY_KEYS)
-            state = final_states(self.acting.encoder, inputs, n_steps - begins.clamp(min=0), first)
+            inputs = [rollout[key] for key in HISTORY_KEYS]
+            state = states_after_rows(self.acting.encoder, inputs, rollout["is_init"][..., 0], state)
             state = state * (~rollout["next", "done"][:, -1]).to(state.dtype)
         return (difference / size) ** 0.5 if size > 0.0 else 0.0
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from beliefgym.agents.recurrent.network import HistoryEncoder
+if TYPE_CHECKING:
+    from beliefgym.agents.recurrent.network import HistoryEncoder
 
 
 @torch.no_grad()
-def final_states(
-    encoder: HistoryEncoder, inputs: tuple[Tensor, ...], lengths: Tensor, first: Tensor
-) -> Tensor:
+def final_states(encoder: HistoryEncoder, inputs: Sequence[Tensor], lengths: Tensor, first: Tensor) -> Tensor:
     """States after the last step of every row.
 
     All rows end together: the longest begins, and others join it where they begin. So nothing is padded, and a memory
@@ -42,3 +43,21 @@ def final_states(
     answer = torch.empty_like(states)
     answer[order] = states
     return answer
+
+
+def states_after_rows(
+    encoder: HistoryEncoder, inputs: Sequence[Tensor], is_init: Tensor, first: Tensor
+) -> Tensor:
+    """States after the last step of rows in which episodes may begin anywhere.
+
+    Args:
+        encoder, inputs: see `final_states`. is_init: (n, n_steps) bool, where an episode begins.
+        first: (n, state_size) the state before each row, which counts where no episode begins in it.
+
+    Returns:
+        (n, state_size).
+    """
+    n_steps = is_init.shape[1]
+    begins = torch.where(is_init, torch.arange(n_steps, device=is_init.device), -1).max(dim=1).values
+    before = torch.where((begins < 0)[:, None], first, 0.0)
+    return final_states(encoder, inputs, n_steps - begins.clamp(min=0), before)

@@ -181,6 +181,7 @@ class RecurrentSAC(Agent):
         if self._collector is None:
             env = self._units.around(self.task.make_vec(self.n_envs))
             self._collector = RolloutCollector(env, self.actor.state_size, self.seed)
+            self._collector.reward_scale = self._reward_scale or 1.0
         end = self.num_timesteps + total_timesteps
         with tqdm(
             total=total_timesteps, desc=type(self).__name__, unit="step", disable=not progress_bar
@@ -356,10 +357,7 @@ class RecurrentSAC(Agent):
         if self._reward_scale is None:
             self._reward_scale = _natural_scale(rollout["next", "reward"], self.gamma)
         if collector.reward_scale != self._reward_scale:
-            ratio = self._reward_scale / collector.reward_scale
-            for key in (("next", "reward"), ("next", "previous_reward"), "previous_reward"):
-                rollout[key] *= ratio
-            collector.reward_scale = self._reward_scale
+            collector.rescale(self._reward_scale, rollout)
 
     def _set_moments(self) -> None:
         """The moments of observations, into every copy of an encoder."""

@@ -25,7 +25,12 @@ from torchrl.objectives import LossModule
 from beliefgym.agents.recurrent.action_choice import action_probabilities
 from beliefgym.agents.recurrent.auxiliary import Pieces
 from beliefgym.agents.recurrent.segments import Segments
-from beliefgym.agents.recurrent.targets import lambda_returns, n_step_returns, step_weights
+from beliefgym.agents.recurrent.targets import (
+    lambda_returns,
+    lambda_weights,
+    n_step_returns,
+    step_weights,
+)
 
 Bootstrap = Literal["taken", "expected", "max", "double"]
 Gradient = Literal["semi", "residual"]
@@ -257,7 +262,11 @@ class RecurrentSarsaLoss(LossModule):
         k = chosen.shape[1] - 1 if self.n_steps is None else self.n_steps
         targets_of_n = n_step_returns(rewards, discounts, following, pieces.is_last, k)
         total = torch.zeros_like(chosen)
-        for weight, target in zip(step_weights(k, self.weights), targets_of_n, strict=True):
+        if self.n_steps is None:
+            shares = lambda_weights(k, float(self.weights))  # type: ignore[arg-type]
+        else:
+            shares = step_weights(k, self.weights)
+        for weight, target in zip(shares, targets_of_n, strict=True):
             if weight > 0.0:
                 total = total + weight * (chosen - target).square()
         return total

@@ -64,11 +64,6 @@ class Segments:
     def __len__(self) -> int:
         return len(self.rows)
 
-    @property
-    def is_trivial(self) -> bool:
-        """True where every row is one piece without padding."""
-        return len(self.rows) * self.mask.shape[1] == self._size
-
     def steps(self, x: Tensor) -> Tensor:
         """(n, n_steps, ...) -> (n_pieces, longest, ...); past a piece's end its last step is repeated."""
         return x.flatten(0, 1)[self._steps]

@@ -83,3 +83,11 @@ def step_weights(n_steps: int, weights: Sequence[float] | float) -> list[float]:
             f"got {weights!r}"
         )
     return [float(w) / float(sum(given)) for w in given]
+
+
+def lambda_weights(n_steps: int, decay: float) -> list[float]:
+    """Those of the lambda-return: (1 - lambda) lambda^n for n < k, and lambda^k for the longest.
+
+    In a piece of fewer than k steps all sums past its end are the one to its end, so that its weights are right too.
+    """
+    return [(1.0 - decay) * decay**n for n in range(n_steps)] + [decay**n_steps]
