@@ -242,3 +242,15 @@ def test_the_guide_to_beliefs_runs(capsys):
     exec(shortened(blocks[1]), names)
     assert names["agent"].filter == "psim-hints"
     assert -1800 < float(capsys.readouterr().out) < 0
+
+
+@in_checkout
+def test_the_guide_to_recurrent_action_values_runs(capsys):
+    blocks = blocks_of(README.parent / "docs" / "recurrent-q.md")
+    assert len(blocks) == 2
+    names: dict = {}
+    exec(blocks[0].replace("50_000", "1_024").replace("n_episodes=100", "n_episodes=5"), names)
+    assert names["agent"].num_timesteps == 1_024
+    assert 1.0 <= float(capsys.readouterr().out) <= 500.0
+    exec(blocks[1], names)
+    assert names["loss"].gradient == "residual"

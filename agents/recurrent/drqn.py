@@ -119,7 +119,7 @@ class DRQN(RecurrentQAgent):
             answer = self.step_optimizer(self.sample())
             self._target.step()
         self.sync_acting()
-        return {key: float(value) for key, value in answer.items()}
+        return {key: float(value.detach()) for key, value in answer.items()}
 
     def sample(self) -> TensorDict:
         """Episodes (whole, or from a random start on) with a zero state at their first step."""

@@ -71,7 +71,7 @@ class RecurrentPQN(RecurrentQAgent):
             for chosen in order.chunk(self._own["n_minibatches"]):
                 answer = self.step_optimizer(rollout[chosen])
         self.sync_acting()
-        return {key: float(value) for key, value in answer.items()}
+        return {key: float(value.detach()) for key, value in answer.items()}
 
     def options(self) -> dict[str, Any]:
         """See `Agent.options`."""

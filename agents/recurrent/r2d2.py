@@ -112,7 +112,7 @@ class R2D2(RecurrentQAgent):
             answer = self.step_optimizer(self.sample())
             self._target.step()
         self.sync_acting()
-        return {key: float(value) for key, value in answer.items()}
+        return {key: float(value.detach()) for key, value in answer.items()}
 
     def sample(self) -> TensorDict:
         """Sequences with the state that was stored at their first step, or zeros."""
