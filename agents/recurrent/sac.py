@@ -14,7 +14,7 @@ memory); Luo et al. 2024, RESeL (encoder's learning rate, whole episodes, the pr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -409,13 +409,9 @@ class RecurrentSAC(Agent):
     def _parameter_groups(self) -> list[dict[str, Any]]:
         """Heads, temperature and decoders in one group, encoders in the other."""
         encoders = [*self.actor.encoder.parameters(), *self.critic.encoder.parameters()]
-        others: Iterator[nn.Parameter] = (
-            parameter
-            for part in (self.actor.head, self.critic.heads, self.loss.auxiliary)
-            for parameter in part.parameters()
-        )
+        slow = {id(parameter) for parameter in encoders}
         return [
-            {"name": "heads", "params": [*others, self.loss.log_alpha]},
+            {"name": "heads", "params": [p for p in self.loss.parameters() if id(p) not in slow]},
             {"name": "encoders", "params": encoders},
         ]
 

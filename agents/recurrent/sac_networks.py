@@ -5,7 +5,8 @@
 
 Actor and critic each have an encoder of their own: the gradients of one would drown the other's in a shared one (Ni et
 al. 2022, Sec. 4). The heads see the present observation besides the hidden state (their shortcut), so that the memory
-may change slowly. Actions are in units of (-1, 1) in each component.
+may change slowly. A hidden state is normalised first: its entries are small at the start, beside observations of unit
+size, and what tells velocities is smaller still. Actions are in units of (-1, 1) in each component.
 
 References: Haarnoja et al. 2018b, App. C (squashed Gaussian); Ni et al. 2022; layer normalisation in the heads as in
 Hiraoka et al. 2022.
@@ -76,6 +77,7 @@ class RecurrentActor(nn.Module):
     def __init__(self, encoder: HistoryEncoder, n_observation: int, n_action: int, width: int = 128) -> None:
         super().__init__()
         self.encoder, self.n_action = encoder, n_action
+        self.norm = nn.LayerNorm(encoder.memory.hidden_size)
         self.head = _head(encoder.memory.hidden_size + n_observation, 2 * n_action, width)
 
     @property
@@ -92,7 +94,7 @@ class RecurrentActor(nn.Module):
             mean and log_std (n, n_steps, n_action) before squashing, and the state after the last step.
         """
         hidden, state = self.encoder(observation, previous_action, previous_reward, state)
-        outputs = self.head(torch.cat([hidden, self.encoder.standardised(observation)], dim=-1))
+        outputs = self.head(torch.cat([self.norm(hidden), self.encoder.standardised(observation)], dim=-1))
         mean, spread = outputs.chunk(2, dim=-1)
         low, high = LOG_STD_RANGE
         return mean, low + 0.5 * (high - low) * (spread.tanh() + 1.0), state
@@ -108,6 +110,7 @@ class RecurrentCritic(nn.Module):
     def __init__(self, encoder: HistoryEncoder, n_observation: int, n_action: int, width: int = 128) -> None:
         super().__init__()
         self.encoder = encoder
+        self.norm = nn.LayerNorm(encoder.memory.hidden_size)
         size = encoder.memory.hidden_size + n_observation + n_action
         self.heads = nn.ModuleList(_head(size, 1, width) for _ in range(2))
 
@@ -133,5 +136,5 @@ class RecurrentCritic(nn.Module):
         Returns:
             (2, n, n_steps).
         """
-        seen = torch.cat([hidden, self.encoder.standardised(observation), action], dim=-1)
+        seen = torch.cat([self.norm(hidden), self.encoder.standardised(observation), action], dim=-1)
         return torch.stack([head(seen)[..., 0] for head in self.heads])
