@@ -58,7 +58,7 @@ def chain(end="truncated", actions=(1, 0)):
 
 
 def of(answer):
-    return float(answer["loss_value"])
+    return answer["loss_value"].item()
 
 
 CASES = {
