@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from beliefgym.agents.agent import Agent, episode_starts, require_box
@@ -222,10 +222,13 @@ class RecurrentQAgent(Agent):
         return dict(self._options)
 
     def parts(self) -> dict[str, bytes]:
-        """The weights of the network that learns and of the one that acts. The optimiser's moments are not kept."""
+        """The weights of the network that learns, of the one that acts, and of auxiliary objectives.
+
+        The optimiser's moments, replays and running episodes are not kept.
+        """
         tensors = {
             f"{name}.{key}": value.contiguous()
-            for name, network in (("network", self.network), ("acting", self.acting))
+            for name, network in self._modules().items()
             for key, value in network.state_dict().items()
         }
         tensors["reward_scale"] = torch.tensor(self._reward_scale or 0.0, dtype=torch.float64)
@@ -236,7 +239,7 @@ class RecurrentQAgent(Agent):
     def restore(self, parts: Mapping[str, bytes]) -> None:
         """See `Agent.restore`."""
         tensors = load_tensors(parts["networks.safetensors"])
-        for name, network in (("network", self.network), ("acting", self.acting)):
+        for name, network in self._modules().items():
             network.load_state_dict(
                 {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
             )
@@ -246,6 +249,9 @@ class RecurrentQAgent(Agent):
         self._moments.from_array(tensors["moments"].numpy())
         self.num_timesteps = int(tensors["num_timesteps"])
         self.epsilon = self._epsilon_at(1.0)
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"network": self.network, "acting": self.acting, "auxiliary": self.loss.auxiliary}
 
     def step_optimizer(self, batch: TensorDict) -> TensorDict:
         """One gradient step on a batch (n, n_steps); the loss's output.
@@ -377,6 +383,11 @@ class RecurrentQAgent(Agent):
         if bins is not None:
             return ActionGrid(self.action_space, bins, "discrete")
         if isinstance(self.action_space, Discrete):
+            if self.action_space.start != 0:
+                raise ValueError(
+                    f"expected actions that are counted from 0, but {self.task.label} has {self.action_space}; "
+                    "shift them with gymnasium.wrappers.TransformAction"
+                )
             return None
         what = "continuous actions" if isinstance(self.action_space, Box) else "actions of several numbers"
         raise ValueError(

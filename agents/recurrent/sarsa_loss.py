@@ -57,7 +57,8 @@ class RecurrentSarsaLoss(LossModule):
         importance: weight what follows a step by min(1, pi(a | h) / mu(a | h)), mu from "action_probability": for
             batches of older policies. It needs `bootstrap="expected"`.
         delay_value: bootstrap with target parameters (TorchRL's `SoftUpdate` or `HardUpdate` moves them).
-        burn_in: steps at the front of a piece that begins inside an episode that bring up its state, without loss.
+        burn_in: steps at the front of a piece that begins inside an episode that bring up its state, without residuals
+            (auxiliary objectives count there too).
         auxiliary: objectives by name. auxiliary_weights: their lambdas; a plain attribute, to be annealed.
 
     Output:

@@ -1,7 +1,9 @@
 """What `RecurrentQSARSA` refuses, what it has to be told, and when it says that it has diverged."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from recurrent_agents import BALANCE, by_network, roll, small
 from recurrent_cases import Scripted
 
@@ -94,3 +96,28 @@ def test_rewards_that_are_not_finite_are_told(options, scripted, monkeypatch):
     )
     with pytest.raises(DivergenceError, match="has diverged at step 0"):
         small(scripted, **options).learn(160)
+
+
+def test_decoders_of_auxiliary_objectives_are_saved_with_their_moments(tmp_path):
+    agent = small(auxiliary={"predictive_state": {"k": 2}}).learn(64)
+    agent.save(tmp_path / "agent")
+    loaded = type(agent).load(tmp_path / "agent")
+    held, found = (one.loss.auxiliary.state_dict() for one in (agent, loaded))
+    assert held.keys() == found.keys()
+    assert all(torch.equal(held[key], found[key]) for key in held)
+    assert held["predictive_state.count"].min() > 0
+
+
+def test_actions_that_are_not_counted_from_0_are_refused():
+    class Shifted(gym.Env):
+        """Two actions, 1 and 2."""
+
+        observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        action_space = gym.spaces.Discrete(2, start=1)
+
+    gym.register("Shifted-v0", entry_point=Shifted)
+    try:
+        with pytest.raises(ValueError, match=r"counted from 0, .* shift them with"):
+            small("Shifted-v0")
+    finally:
+        del gym.registry["Shifted-v0"]
