@@ -151,12 +151,13 @@ def test_sequences_show_every_step_after_the_burn_in():
 
 
 def test_only_the_last_steps_are_kept():
-    replay = filled([[6] * 20, [10] * 12], 60, capacity=48)
+    replay = filled([[6] * 20, [10] * 12, [5] * 20], 60, capacity=3 * 24)
     batch = replay.episodes(500, generator())
     drawn = {tuple(x) for x in batch["observation"][:, 0, :2].long().tolist()}
-    # 24 steps of each copy: from step 36 on, where episode 6 of the one begins; episode 3 of the other began before
-    assert drawn == {(0, 6), (0, 7), (0, 8), (0, 9), (1, 4), (1, 5)}
-    assert len(replay) == 24 + 20
+    # 24 steps of each copy, from step 36 on, where one episode begins; the others' began at 30 and at 35
+    kept = {0: range(6, 10), 1: range(4, 6), 2: range(8, 12)}
+    assert drawn == {(copy, episode) for copy, episodes in kept.items() for episode in episodes}
+    assert len(replay) == 24 + 20 + 20
 
 
 def test_an_episode_is_drawn_from_while_it_runs():
