@@ -44,7 +44,7 @@ class DRQN(RecurrentQAgent):
         n_batches: gradient steps after each rollout; None for 32 of random updates, 8 of sequential ones.
         capacity: steps that the replay keeps. learning_starts: steps in it before the first gradient step.
         target_update: see `target_updater`.
-        double: double Q-learning.
+        double: double Q-learning. learning_rate: see `RecurrentQAgent`.
 
     Raises:
         ValueError: numbers out of range.

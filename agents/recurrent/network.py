@@ -31,7 +31,7 @@ class HistoryEncoder(nn.Module):
     Args:
         n_observation, n_action: sizes of an observation and of an action as it is put in (one-hot where discrete).
         hidden_size: size of h. width: of the layer before the memory.
-        cell: "lstm", "gru", "none", or a `Memory` class.
+        cell: "lstm", "gru", "none", "stack4" (and 2, 8), or a `Memory` class.
         rewards: put the previous reward in; it then has to be told when acting.
         previous_actions: put the previous action in.
     """

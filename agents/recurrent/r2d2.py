@@ -36,7 +36,7 @@ class R2D2(RecurrentQAgent):
         n_steps: rewards in a target before it bootstraps.
         batch_size: sequences in a gradient step. n_batches: gradient steps after each rollout.
         capacity: steps that the replay keeps. learning_starts: steps in it before the first gradient step.
-        target_update: see `target_updater`.
+        target_update: see `target_updater`. learning_rate: see `RecurrentQAgent`.
 
     Raises:
         ValueError: numbers out of range.
