@@ -13,9 +13,10 @@ from beliefgym.agents.recurrent.drqn import DRQN
 from beliefgym.agents.recurrent.memory import Memory
 from beliefgym.agents.recurrent.network import HistoryEncoder, RecurrentQNetwork
 from beliefgym.agents.recurrent.pqn import RecurrentPQN
-from beliefgym.agents.recurrent.q_agent import DivergenceError, RecurrentQAgent
+from beliefgym.agents.recurrent.q_agent import RecurrentQAgent
 from beliefgym.agents.recurrent.q_sarsa import RecurrentQSARSA
 from beliefgym.agents.recurrent.r2d2 import R2D2
+from beliefgym.agents.recurrent.recurrent_agent import DivergenceError, RecurrentAgent
 from beliefgym.agents.recurrent.sac import RecurrentSAC
 from beliefgym.agents.recurrent.sarsa_loss import RecurrentSarsaLoss
 
@@ -31,6 +32,7 @@ __all__ = [
     "PredictiveRewards",
     "PredictiveState",
     "PredictiveValues",
+    "RecurrentAgent",
     "RecurrentPQN",
     "RecurrentQAgent",
     "RecurrentQNetwork",

@@ -20,7 +20,6 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
-from beliefgym.agents.recurrent.auxiliary import make_auxiliary
 from beliefgym.agents.recurrent.collector import RolloutCollector
 from beliefgym.agents.recurrent.network import HISTORY_KEYS
 from beliefgym.agents.recurrent.q_agent import RecurrentQAgent
@@ -97,17 +96,6 @@ class RecurrentQSARSA(RecurrentQAgent):
     def make_loss(self) -> RecurrentSarsaLoss:
         """See `RecurrentQAgent.make_loss`."""
         own = self._own
-        n_observation = self.observation_space.shape[0]  # type: ignore[index]
-        objectives = {
-            name: make_auxiliary(
-                name,
-                self._options["hidden_size"],
-                n_observation,
-                self.n_actions,
-                **{key: value for key, value in options.items() if key != "weight"},
-            )
-            for name, options in own["auxiliary"].items()
-        }
         return RecurrentSarsaLoss(
             self.network,
             gamma=self.gamma,
@@ -117,7 +105,7 @@ class RecurrentQSARSA(RecurrentQAgent):
             gradient=own["gradient"],
             importance=own["reuse"] > 1,
             delay_value=own["average"] > 0.0,
-            auxiliary=objectives,
+            auxiliary=self._objectives(own["auxiliary"]),
         )
 
     def before_rollout(self, collector: RolloutCollector) -> dict[str, Any]:
@@ -128,10 +116,7 @@ class RecurrentQSARSA(RecurrentQAgent):
 
     def improve(self, rollout: TensorDict, progress: float) -> dict[str, Any]:
         """Fit Q to the rollouts that are kept; see `RecurrentQAgent.improve`."""
-        self.loss.auxiliary_weights = {
-            name: _annealed(options.get("weight", 1.0), progress)
-            for name, options in self._own["auxiliary"].items()
-        }
+        self.loss.auxiliary_weights = self._objective_weights(self._own["auxiliary"], progress)
         self._rollouts = (
             [*self._rollouts[-(self._own["reuse"] - 1) :], rollout] if self._own["reuse"] > 1 else [rollout]
         )
@@ -167,10 +152,3 @@ class RecurrentQSARSA(RecurrentQAgent):
     def options(self) -> dict[str, Any]:
         """See `Agent.options`."""
         return {**super().options(), **self._own}
-
-
-def _annealed(weight: float | str, progress: float) -> float:
-    """A constant, or "linear:w" for w (1 - progress)."""
-    if isinstance(weight, str):
-        return float(weight.removeprefix("linear:")) * (1.0 - progress)
-    return float(weight)

@@ -34,7 +34,7 @@ from beliefgym.agents.recurrent.sac_networks import (
     log_density,
     squashed_gaussian,
 )
-from beliefgym.agents.recurrent.segments import Segments
+from beliefgym.agents.recurrent.segments import Segments, batch_segments
 from beliefgym.agents.recurrent.targets import lambda_returns
 
 
@@ -130,14 +130,14 @@ class RecurrentSACLoss(LossModule):
         """See the class.
 
         Raises:
-            ValueError: a batch that is not (n, n_steps).
+            ValueError: a batch that is not (n, n_steps), or has no step that counts.
         """
         if tensordict.ndim != 2:
             raise ValueError(
                 f"expected a batch (n, n_steps) of sequences, got batch size {tuple(tensordict.shape)}"
             )
         keys = self.tensor_keys
-        pieces = Segments(_flag(tensordict, keys.is_init), _flag(tensordict, keys.mask))
+        pieces = batch_segments(tensordict, keys.is_init, keys.mask)
         observation, previous_action, previous_reward = (
             pieces.slots(tensordict.get(key), tensordict.get(("next", key)))
             for key in (keys.observation, keys.previous_action, keys.previous_reward)
@@ -231,8 +231,3 @@ class RecurrentSACLoss(LossModule):
 def _shifted(x: Tensor) -> Tensor:
     """x_{t+1} at t; the last column is repeated, and must not count."""
     return torch.cat([x[:, 1:], x[:, -1:]], dim=1)
-
-
-def _flag(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    flag = tensordict.get(key, None)
-    return flag if flag is None or flag.ndim == 2 else flag[..., 0]

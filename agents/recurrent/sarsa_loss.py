@@ -24,7 +24,7 @@ from torchrl.objectives import LossModule
 
 from beliefgym.agents.recurrent.action_choice import action_probabilities
 from beliefgym.agents.recurrent.auxiliary import Pieces
-from beliefgym.agents.recurrent.segments import Segments
+from beliefgym.agents.recurrent.segments import Segments, batch_segments
 from beliefgym.agents.recurrent.targets import (
     lambda_returns,
     lambda_weights,
@@ -132,14 +132,14 @@ class RecurrentSarsaLoss(LossModule):
         """See the class.
 
         Raises:
-            ValueError: a batch that is not (n, n_steps).
+            ValueError: a batch that is not (n, n_steps), or has no step that counts.
         """
         if tensordict.ndim != 2:
             raise ValueError(
                 f"expected a batch (n, n_steps) of rollouts, got batch size {tuple(tensordict.shape)}"
             )
         keys = self.tensor_keys
-        pieces = Segments(_flag(tensordict, keys.is_init), _flag(tensordict, keys.mask))
+        pieces = batch_segments(tensordict, keys.is_init, keys.mask)
         rolled = self._slots(tensordict, pieces)
         online = self._roll(rolled, self.value_network_params)
         values, hidden = online.get(keys.action_value), online.get(keys.hidden)
@@ -297,11 +297,6 @@ def _of(values: Tensor, action: Tensor) -> Tensor:
 def _shifted(x: Tensor) -> Tensor:
     """x_{t+1} at t; the last column is repeated, and must not count."""
     return torch.cat([x[:, 1:], x[:, -1:]], dim=1)
-
-
-def _flag(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    flag = tensordict.get(key, None)
-    return flag if flag is None or flag.ndim == 2 else flag[..., 0]
 
 
 def _categorical(action: Tensor, n_actions: int) -> Tensor:

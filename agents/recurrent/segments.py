@@ -10,7 +10,10 @@ no reset inside, and the value after step t is always that of slot t + 1.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 
@@ -75,3 +78,22 @@ class Segments:
     def back(self, pieces: Tensor) -> Tensor:
         """(n_pieces, longest, ...) -> (n_steps of all pieces, ...) in the order of the rows: the reverse of `steps`."""
         return pieces[self.mask]
+
+
+def batch_segments(batch: TensorDictBase, is_init: NestedKey, mask: NestedKey) -> Segments:
+    """The pieces of a batch (n, n_steps), from its flags (n, n_steps) or (n, n_steps, 1) under these keys.
+
+    Raises:
+        ValueError: a mask that is False at every step; see also `Segments`.
+    """
+    pieces = Segments(*(_flag(batch.get(key, None)) for key in (is_init, mask)))
+    if len(pieces) == 0:
+        raise ValueError(
+            f"expected at least one step that exists, got {mask!r} False at all of {tuple(batch.shape)} steps: leave "
+            "such a batch out, or set the mask True at the steps that were recorded"
+        )
+    return pieces
+
+
+def _flag(flag: Tensor | None) -> Any:
+    return flag if flag is None or flag.ndim == 2 else flag[..., 0]

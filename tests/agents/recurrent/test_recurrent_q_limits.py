@@ -9,7 +9,7 @@ from recurrent_cases import Scripted
 
 from beliefgym.agents import evaluate
 from beliefgym.agents.recurrent.memory import GRU
-from beliefgym.agents.recurrent.q_agent import DivergenceError
+from beliefgym.agents.recurrent.recurrent_agent import DivergenceError
 
 TOLD = {"rtol": 0, "atol": 1e-5}  # single precision, over a few dozen steps
 

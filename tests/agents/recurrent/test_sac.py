@@ -9,7 +9,7 @@ from beliefgym.agents import evaluate
 from beliefgym.agents.recurrent.action_units import ActionUnits
 from beliefgym.agents.recurrent.collector import RolloutCollector
 from beliefgym.agents.recurrent.memory import GRU
-from beliefgym.agents.recurrent.q_agent import DivergenceError
+from beliefgym.agents.recurrent.recurrent_agent import DivergenceError
 from beliefgym.agents.recurrent.replay import EpisodeReplay
 from beliefgym.agents.recurrent.sac import RecurrentSAC
 from beliefgym.agents.recurrent.sac_networks import log_density
@@ -80,7 +80,7 @@ def test_encoders_have_a_learning_rate_of_their_own():
 
 def test_learning_rates_fall_linearly():
     agent = small(learning_rate="linear:1e-3", encoder_learning_rate="linear:4e-4")
-    agent._set_learning_rates(0.75)
+    agent._anneal(0.75)
     assert [group["lr"] for group in agent.optimizer.param_groups] == pytest.approx([2.5e-4, 1e-4])
 
 
@@ -234,14 +234,25 @@ def test_callback_sees_rollouts_and_stops():
     assert agent.num_timesteps == 96
 
 
-def test_divergence_is_named():
+@pytest.mark.parametrize("share", [np.nan, 1.01])
+def test_divergence_is_named(share):
+    """What is not finite, and what is beyond a hundred times the largest sum of rewards."""
     agent = small(updates_per_step=0.0).learn(80)
+    batch = agent.sample()
+    largest = 100.0 * float(agent._replay._store["next", "reward"].abs().max()) / (1.0 - agent.gamma)
+    assert largest > 1000.0
+    heads = [head[-1] for head in agent.critic.heads]
     with torch.no_grad():
-        agent.critic.heads[0][-1].bias.fill_(np.nan)
+        for head in heads:
+            head.weight.zero_()
+            head.bias.fill_(0.99 * largest)
+    agent.step_optimizer(batch)
+    with torch.no_grad():
+        heads[0].bias.fill_(share * largest)
     with pytest.raises(
-        DivergenceError, match=r"RecurrentSAC on .* has diverged at step 80: .*smaller learning_rate"
+        DivergenceError, match=r"RecurrentSAC on .* has diverged at step 80: .*smaller learning_rate.*average"
     ):
-        agent.step_optimizer(agent.sample())
+        agent.step_optimizer(batch)
 
 
 def test_discrete_actions_are_sent_to_recurrent_q_sarsa():

@@ -365,3 +365,14 @@ def test_batches_of_another_form_are_refused():
         loss(batch[:, 0])
     with pytest.raises(ValueError, match="traces need the density of each action when it was drawn"):
         loss(batch.exclude("action_probability"))
+
+
+def test_a_batch_of_nothing_but_padding_is_refused():
+    batch = made_up_rollout()
+    batch["mask"] = torch.zeros(5, 7, dtype=torch.bool)
+    with pytest.raises(
+        ValueError, match=r"at least one step .* got 'mask' False at all of \(5, 7\) steps: leave"
+    ):
+        made_up_loss()(batch)
+    batch["mask"][3, 0] = True
+    assert of(made_up_loss(), batch)["loss_critic"].isfinite()

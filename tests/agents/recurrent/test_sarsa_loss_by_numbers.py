@@ -189,6 +189,17 @@ def test_a_batch_that_is_not_of_rollouts_is_refused():
         RecurrentSarsaLoss(table())(chain()[0])
 
 
+@pytest.mark.parametrize("shape", [(1, 2), (1, 2, 1)])
+def test_a_batch_of_nothing_but_padding_is_refused(shape):
+    rollout = chain().set("there", torch.zeros(shape, dtype=torch.bool))
+    loss = RecurrentSarsaLoss(table())
+    loss.set_keys(mask="there")
+    with pytest.raises(
+        ValueError, match=r"at least one step .* got 'there' False at all of \(1, 2\) steps: leave"
+    ):
+        loss(rollout)
+
+
 def test_importance_needs_the_probabilities():
     loss = RecurrentSarsaLoss(q_network(), importance=True, bootstrap="expected")
     with pytest.raises(ValueError, match="need the probability of each action .* 'action_probability'"):
