@@ -18,13 +18,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict
-from torchrl.objectives import SoftUpdate
 
 from beliefgym.agents.recurrent.collector import RolloutCollector
 from beliefgym.agents.recurrent.network import HISTORY_KEYS
 from beliefgym.agents.recurrent.q_agent import RecurrentQAgent
 from beliefgym.agents.recurrent.rolling import states_after_rows
 from beliefgym.agents.recurrent.sarsa_loss import Bootstrap, Gradient, RecurrentSarsaLoss
+from beliefgym.agents.recurrent.target_network import AveragedParams
 from beliefgym.wrappers.task import Task
 
 Refresh = Literal["all", "running", "none"]
@@ -91,7 +91,7 @@ class RecurrentQSARSA(RecurrentQAgent):
             )
         self._rollouts: list[TensorDict] = []
         super().__init__(task, seed, temperature=temperature, **shared)
-        self._average = SoftUpdate(self.loss, eps=average) if average > 0.0 else None
+        self._average = AveragedParams(self.loss, "value_network", average) if average > 0.0 else None
 
     def make_loss(self) -> RecurrentSarsaLoss:
         """See `RecurrentQAgent.make_loss`."""

@@ -22,7 +22,6 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.objectives import SoftUpdate
 
 from beliefgym.agents.recurrent.action_units import ActionUnits
 from beliefgym.agents.recurrent.collector import Acted, RolloutCollector, Seen
@@ -32,6 +31,7 @@ from beliefgym.agents.recurrent.replay import EpisodeReplay
 from beliefgym.agents.recurrent.sac_loss import RecurrentSACLoss
 from beliefgym.agents.recurrent.sac_networks import RecurrentActor, RecurrentCritic, squashed_gaussian
 from beliefgym.agents.recurrent.schedules import annealed
+from beliefgym.agents.recurrent.target_network import AveragedParams
 from beliefgym.wrappers.task import Task
 
 ENCODER_SHARE = 30.0  # the heads' learning rate over the encoders' (RESeL)
@@ -142,7 +142,7 @@ class RecurrentSAC(RecurrentAgent):
             self.actor = RecurrentActor(self._encoder(), self.n_observation, self.n_action, width)
             self.critic = RecurrentCritic(self._encoder(), self.n_observation, self.n_action, width)
             self.loss: RecurrentSACLoss = self._make_loss()
-        self._average = SoftUpdate(self.loss, eps=average)
+        self._average = AveragedParams(self.loss, "critic_network", average)
         self.optimizer = torch.optim.Adam(self._parameter_groups(), foreach=True)
         self._anneal(0.0)
 

@@ -25,9 +25,9 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
 
 from beliefgym.agents.recurrent.auxiliary import Pieces
+from beliefgym.agents.recurrent.bound_loss import BoundLoss
 from beliefgym.agents.recurrent.sac_networks import (
     RecurrentActor,
     RecurrentCritic,
@@ -38,7 +38,7 @@ from beliefgym.agents.recurrent.segments import Segments, batch_segments
 from beliefgym.agents.recurrent.targets import lambda_returns
 
 
-class RecurrentSACLoss(LossModule):
+class RecurrentSACLoss(BoundLoss):
     """Losses of actor, critic and temperature along recorded sequences.
 
     The input is a tensordict (n, n_steps) in TorchRL's layout with the keys of `RolloutCollector`, actions in (-1, 1):
@@ -150,20 +150,20 @@ class RecurrentSACLoss(LossModule):
         weights = self._weights(pieces, rewards)
         n, alpha = len(pieces), self.log_alpha.exp().detach()
 
-        actor, critic = self.actor_network, self.critic_network
-        with self.actor_network_params.to_module(actor):
-            mean, log_std, _ = actor(*history, observation.new_zeros(n, actor.state_size))
+        actor, critic = self.bound("actor_network"), self.bound("critic_network")
+        averaged, fixed = self.bound("critic_network", "target"), self.bound("critic_network", "fixed")
+        mean, log_std, _ = actor(*history, observation.new_zeros(n, actor.state_size))
         noise = torch.empty_like(mean).normal_(generator=self.generator)
         drawn, log_probability = squashed_gaussian(mean, log_std, noise)
 
         first = observation.new_zeros(n, critic.state_size)
-        with torch.no_grad(), self.target_critic_network_params.to_module(critic):
-            later_hidden, _ = critic.hidden(*history, first)
-            later = critic.values(later_hidden[:, 1:], observation[:, 1:], drawn[:, 1:]).min(0).values
+        with torch.no_grad():
+            later_hidden, _ = averaged.hidden(*history, first)
+            later = averaged.values(later_hidden[:, 1:], observation[:, 1:], drawn[:, 1:]).min(0).values
             following = later - alpha * log_probability[:, 1:]
             targets = rewards + discounts * following
             if self.trace_decay > 0.0:
-                anchors = critic.values(later_hidden[:, :-1], observation[:, :-1], action).min(0).values
+                anchors = averaged.values(later_hidden[:, :-1], observation[:, :-1], action).min(0).values
                 traces = self.trace_decay * self._corrections(tensordict, pieces, mean, log_std, action)
                 targets = lambda_returns(
                     rewards,
@@ -172,12 +172,9 @@ class RecurrentSACLoss(LossModule):
                     _shifted(traces) * (~pieces.is_last).to(rewards.dtype),
                     _shifted(anchors),
                 )
-        with self.critic_network_params.to_module(critic):
-            hidden, _ = critic.hidden(*history, first)
-            values = critic.values(hidden[:, :-1], observation[:, :-1], action)
-        with self.critic_network_params.data.to_module(critic):
-            best = critic.values(hidden[:, :-1].detach(), observation[:, :-1], drawn[:, :-1]).min(0).values
-
+        hidden, _ = critic.hidden(*history, first)
+        values = critic.values(hidden[:, :-1], observation[:, :-1], action)
+        best = fixed.values(hidden[:, :-1].detach(), observation[:, :-1], drawn[:, :-1]).min(0).values
         errors = (values - targets).square()
         log_probability = log_probability[:, :-1]
         entropy = -(log_probability.detach() * weights).sum()

@@ -20,10 +20,11 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives import LossModule
 
 from beliefgym.agents.recurrent.action_choice import action_probabilities
 from beliefgym.agents.recurrent.auxiliary import Pieces
+from beliefgym.agents.recurrent.bound_loss import BoundLoss
+from beliefgym.agents.recurrent.network import RecurrentQNetwork
 from beliefgym.agents.recurrent.segments import Segments, batch_segments
 from beliefgym.agents.recurrent.targets import (
     lambda_returns,
@@ -36,7 +37,7 @@ Bootstrap = Literal["taken", "expected", "max", "double"]
 Gradient = Literal["semi", "residual"]
 
 
-class RecurrentSarsaLoss(LossModule):
+class RecurrentSarsaLoss(BoundLoss):
     """Bellman residuals of a recurrent Q network along recorded rollouts, with auxiliary objectives.
 
     The input is a tensordict (n, n_steps) in TorchRL's layout, as a collector or this package's gives it: rows may hold
@@ -140,14 +141,12 @@ class RecurrentSarsaLoss(LossModule):
             )
         keys = self.tensor_keys
         pieces = batch_segments(tensordict, keys.is_init, keys.mask)
-        rolled = self._slots(tensordict, pieces)
-        online = self._roll(rolled, self.value_network_params)
-        values, hidden = online.get(keys.action_value), online.get(keys.hidden)
+        inputs, first = self._slots(tensordict, pieces)
+        values, hidden = self._roll(self.bound("value_network"), inputs, first, pieces)
         later, later_hidden = values, hidden
         if self.delay_value:
             with torch.no_grad():
-                target = self._roll(rolled, self.target_value_network_params)
-            later, later_hidden = target.get(keys.action_value), target.get(keys.hidden)
+                later, later_hidden = self._roll(self.bound("value_network", "target"), inputs, first, pieces)
         elif self.gradient == "semi":
             later, later_hidden = values.detach(), hidden.detach()
         action = pieces.steps(_categorical(tensordict.get(keys.action), values.shape[-1]))
@@ -178,7 +177,7 @@ class RecurrentSarsaLoss(LossModule):
             given = Pieces(
                 hidden,
                 later_hidden,
-                self._standardised(rolled.get(keys.observation)),
+                self._standardised(inputs[keys.observation]),
                 nn.functional.one_hot(action, values.shape[-1]).to(rewards.dtype),
                 rewards,
                 lambda: self._returns(pieces, rewards, discounts, later),
@@ -189,26 +188,39 @@ class RecurrentSarsaLoss(LossModule):
                     out[f"loss_{name}"] = weight * objective(given)
         return TensorDict(out, [])
 
-    def _slots(self, tensordict: TensorDictBase, pieces: Segments) -> TensorDict:
-        """The pieces with what followed them, as one rollout without resets inside."""
-        n, longest = len(pieces), pieces.mask.shape[1] + 1
-        rolled = TensorDict({}, [n, longest])
-        for key in self.history_keys:
-            rolled.set(key, pieces.slots(tensordict.get(key), tensordict.get(("next", key))))
-        is_init = pieces.fresh.new_zeros(n, longest, 1)
-        is_init[:, 0, 0] = pieces.fresh
-        rolled.set(self.tensor_keys.is_init, is_init)
+    def _slots(
+        self, tensordict: TensorDictBase, pieces: Segments
+    ) -> tuple[dict[NestedKey, Tensor], dict[NestedKey, Tensor]]:
+        """What the network reads along the pieces and what followed them, and the states that they begin with."""
+        inputs: dict[NestedKey, Tensor] = {
+            key: pieces.slots(tensordict.get(key), tensordict.get(("next", key))) for key in self.history_keys
+        }
+        first: dict[NestedKey, Tensor] = {}
         for key in self.value_network.in_keys:
             if "recurrent_state" in key or key == self.tensor_keys.recurrent_state:
-                first = tensordict.get(key)[pieces.rows, pieces.starts]
-                first = torch.where(pieces.fresh.view(-1, *[1] * (first.ndim - 1)), 0.0, first)
-                rolled.set(key, first[:, None].expand(n, longest, *first.shape[1:]))
-        return rolled
+                state = tensordict.get(key)[pieces.rows, pieces.starts]
+                first[key] = torch.where(pieces.fresh.view(-1, *[1] * (state.ndim - 1)), 0.0, state)
+        return inputs, first
 
-    def _roll(self, rolled: TensorDict, parameters: TensorDictParams) -> TensorDictBase:
-        with parameters.to_module(self.value_network, preserve_module_state=False), set_recurrent_mode(True):
-            answer: TensorDictBase = self.value_network(rolled.clone(False))
-        return answer
+    def _roll(
+        self,
+        network: Any,
+        inputs: Mapping[NestedKey, Tensor],
+        first: Mapping[NestedKey, Tensor],
+        pieces: Segments,
+    ) -> tuple[Tensor, Tensor]:
+        """Action values and hidden states of every slot; one of the networks here needs no tensordict for it."""
+        keys = self.tensor_keys
+        if isinstance(network, RecurrentQNetwork):
+            values, hidden, _ = network.values(*inputs.values(), *first.values())
+            return values, hidden
+        n, longest = len(pieces), pieces.mask.shape[1] + 1
+        is_init = pieces.fresh.new_zeros(n, longest, 1)
+        is_init[:, 0, 0] = pieces.fresh
+        states = {key: state[:, None].expand(n, longest, *state.shape[1:]) for key, state in first.items()}
+        with set_recurrent_mode(True):
+            answer = network(TensorDict({**inputs, **states, keys.is_init: is_init}, [n, longest]))
+        return answer.get(keys.action_value), answer.get(keys.hidden)
 
     def _policy(self, values: Tensor) -> Tensor:
         return action_probabilities(values, self.epsilon, self.temperature)

@@ -2,12 +2,62 @@
 
 from __future__ import annotations
 
-from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
-from torchrl.objectives.utils import TargetNetUpdater
+from typing import Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import HardUpdate, LossModule
 
 
-def target_updater(loss: LossModule, update: float) -> TargetNetUpdater:
-    """TorchRL's updater; its `step` is called after each gradient step.
+class Updater(Protocol):
+    """What follows; TorchRL's updaters do."""
+
+    def step(self) -> None:
+        """Called after each gradient step."""
+
+
+class AveragedParams:
+    """theta' <- eps theta' + (1 - eps) theta from theta' = theta on, in one call for all parameters.
+
+    It is TorchRL's SoftUpdate, which goes by each tensor. Buffers are not averaged.
+
+    Args:
+        loss: that holds both. name: of the network. eps: the share that stays, from 0 to below 1.
+
+    Raises:
+        ValueError: a share out of range.
+    """
+
+    def __init__(self, loss: LossModule, name: str, eps: float) -> None:
+        if not 0.0 <= eps < 1.0:
+            raise ValueError(f"expected the share of the average that stays from 0 to below 1, got {eps}")
+        loss._has_update_associated[name] = True  # or the loss warns that nothing moves its target
+        self.source: TensorDictBase = getattr(loss, f"{name}_params")
+        self.target: TensorDictBase = getattr(loss, f"target_{name}_params")
+        self.eps = eps
+        self._pairs: tuple[list[Tensor], list[Tensor]] | None = None
+        for key, value in self.target.items(include_nested=True, leaves_only=True):
+            value.data.copy_(self.source.get(key).data)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """One step of the average."""
+        if self._pairs is None:
+            leaves = self.source.items(include_nested=True, leaves_only=True)
+            keys = [key for key, value in leaves if value.requires_grad]
+            self._pairs = (
+                [self.target.get(key).data for key in keys],
+                [self.source.get(key).data for key in keys],
+            )
+        torch._foreach_lerp_(*self._pairs, 1.0 - self.eps)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_pairs": None}
+
+
+def target_updater(loss: LossModule, update: float) -> Updater:
+    """The updater of a loss's target parameters; its `step` is called after each gradient step.
 
         soft: theta' <- (1 - tau) theta' + tau theta        hard: theta' <- theta
 
@@ -25,6 +75,7 @@ def target_updater(loss: LossModule, update: float) -> TargetNetUpdater:
             f"(hard), got {update}"
         )
     if update < 1:
-        return SoftUpdate(loss, tau=float(update))
+        return AveragedParams(loss, "value_network", 1.0 - float(update))
     # TorchRL's counter copies at the first step after the interval
-    return HardUpdate(loss, value_network_update_interval=int(update) - 1)
+    hard: Updater = HardUpdate(loss, value_network_update_interval=int(update) - 1)
+    return hard

@@ -34,11 +34,11 @@ def lambda_returns(
     """
     fixed = rewards + discounts * (values - weights * anchors)
     carried = discounts * weights
-    returns = torch.empty_like(fixed)
-    following = torch.zeros_like(fixed[:, 0])
-    for t in range(fixed.shape[1] - 1, -1, -1):
-        following = torch.addcmul(fixed[:, t], carried[:, t], following, out=returns[:, t])
-    return returns
+    following, returns = torch.zeros_like(fixed[:, 0]), []
+    for fixed_t, carried_t in zip(reversed(fixed.unbind(1)), reversed(carried.unbind(1)), strict=True):
+        following = torch.addcmul(fixed_t, carried_t, following)
+        returns.append(following)
+    return torch.stack(returns[::-1], dim=1)
 
 
 def n_step_returns(
