@@ -9,6 +9,7 @@ from beliefgym.agents.dad_control import DaDControl
 from beliefgym.agents.evaluation import Evaluation, evaluate
 from beliefgym.agents.expert import Expert
 from beliefgym.agents.exploration import Exploration
+from beliefgym.agents.filter_expert import FilterExpert
 from beliefgym.agents.policy_synthesis import (
     OpenLoopSynthesis,
     RecedingHorizonSynthesis,
@@ -48,6 +49,7 @@ __all__ = [
     "Evaluation",
     "Expert",
     "Exploration",
+    "FilterExpert",
     "OpenLoopSynthesis",
     "ProbabilisticEnsembleControl",
     "RandomAgent",

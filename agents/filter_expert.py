@@ -3,7 +3,8 @@
     m_t = E[s_t | x_0 .. x_t, a_0 .. a_{t-1}]  (Kalman filter of the exact model)        a_t = expert(m_t)
 
 Beside agents that learn from observations it stands for the textbook: a linear system with Gaussian noise is
-controlled best so (LQG, the separation principle), others nearly so while the estimate is good.
+controlled best so (LQG, the separation principle), others nearly so while the estimate is good. Where a belief has
+several modes, as of a pendulum's angle that was not seen yet, its mean is no state to act on.
 """
 
 from __future__ import annotations

@@ -184,6 +184,12 @@ for _spec in (
         "random", "beliefgym.agents.random_agent:RandomAgent", "uniform actions; score 0", learns=False
     ),
     AgentSpec("expert", "beliefgym.agents.expert:Expert", "true model and full state; score 1", learns=False),
+    AgentSpec(
+        "filter-expert",
+        "beliefgym.agents.filter_expert:FilterExpert",
+        "the expert on the estimate of a Kalman filter that knows the system",
+        learns=False,
+    ),
     AgentSpec("ppo", _SB3, "SB3's PPO on the last observation alone", _sb3("PPO")),
     AgentSpec("ppo-stack", _SB3, "SB3's PPO on the last 4 observations", _sb3("PPO", n_stack=4)),
     AgentSpec("sac", _SB3, "SB3's SAC on the last observation alone", _sb3("SAC")),

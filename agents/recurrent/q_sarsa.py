@@ -37,6 +37,8 @@ class RecurrentQSARSA(RecurrentQAgent):
         task, seed: see `RecurrentQAgent`, which takes all further arguments.
         reuse: rollouts that are learned from at a time, the newest among them.
         n_batches: gradient steps after each rollout; together they go once through what is kept.
+        importance: cut what followed a step of an older policy by min(1, pi / mu) (Retrace); False cuts nothing, which
+            reaches further back and holds while policies differ little (Q(lambda) of Harutyunyan et al. 2016).
         average: the share that stays of the averaged network at each gradient step; 0 for no average.
         bootstrap, gradient, n_steps, weights: see `RecurrentSarsaLoss`.
         refresh: which hidden states are rolled anew when the network has changed: "all", those of running episodes and
@@ -59,6 +61,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         *,
         reuse: int = 32,
         n_batches: int = 16,
+        importance: bool = True,
         average: float = 0.99,
         bootstrap: Bootstrap = "expected",
         gradient: Gradient = "semi",
@@ -72,6 +75,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         self._own: dict[str, Any] = {
             "reuse": reuse,
             "n_batches": n_batches,
+            "importance": importance,
             "average": average,
             "bootstrap": bootstrap,
             "gradient": gradient,
@@ -103,7 +107,7 @@ class RecurrentQSARSA(RecurrentQAgent):
             weights=own["weights"],
             bootstrap=own["bootstrap"],
             gradient=own["gradient"],
-            importance=own["reuse"] > 1,
+            importance=own["importance"] and own["reuse"] > 1,
             delay_value=own["average"] > 0.0,
             auxiliary=self._objectives(own["auxiliary"]),
         )
