@@ -39,7 +39,7 @@ class RecurrentQAgent(RecurrentAgent):
         learning_rate: a number, or "linear:1e-3" for one that falls to 0.
         max_grad_norm: gradients are scaled down to it.
         epsilon: share of random actions at the start, at the end, and the share of training over which it falls.
-        temperature: of the soft-max policy, in units of scaled rewards; 0 for arg max.
+        temperature: of the soft-max policy, in units of scaled rewards; "linear:0.1" falls to 0, which is arg max.
         reward_scale: rewards are multiplied by it; "auto" chooses sqrt(1 - gamma^2) / rms(r) from the first rollout.
 
     Attributes:
@@ -67,7 +67,7 @@ class RecurrentQAgent(RecurrentAgent):
         learning_rate: float | str = "linear:2e-3",
         max_grad_norm: float = 10.0,
         epsilon: tuple[float, float, float] = (1.0, 0.05, 0.1),
-        temperature: float = 0.0,
+        temperature: float | str = 0.0,
         reward_scale: float | str = "auto",
     ) -> None:
         options = {
@@ -89,7 +89,7 @@ class RecurrentQAgent(RecurrentAgent):
         super().__init__(task, seed, options)
         self._grid = self._action_grid(bins)
         self.n_actions = self.n_action = int(self._choices().n)
-        self.epsilon, self.temperature = self._epsilon_at(0.0), temperature
+        self.epsilon, self.temperature = self._epsilon_at(0.0), annealed(temperature, 0.0)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.network = RecurrentQNetwork(self._encoder(), self.n_actions, width)
@@ -109,6 +109,7 @@ class RecurrentQAgent(RecurrentAgent):
         if self.loss.delay_value:
             _copy(TensorDict.from_module(self.acting), self.loss.target_value_network_params)
         self.epsilon = self._epsilon_at(1.0)
+        self.temperature = annealed(self._options["temperature"], 1.0)
 
     def sync_acting(self) -> None:
         """The acting network becomes the target network of the loss, or the network itself without one."""
@@ -136,6 +137,7 @@ class RecurrentQAgent(RecurrentAgent):
 
     def _anneal(self, progress: float) -> None:
         self.epsilon = self._epsilon_at(progress)
+        self.temperature = annealed(self._options["temperature"], progress)
         self.loss.epsilon, self.loss.temperature = self.epsilon, self.temperature
         for group in self.optimizer.param_groups:
             group["lr"] = annealed(self._options["learning_rate"], progress)

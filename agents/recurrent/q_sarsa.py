@@ -40,6 +40,8 @@ class RecurrentQSARSA(RecurrentQAgent):
         importance: cut what followed a step of an older policy by min(1, pi / mu) (Retrace); False cuts nothing, which
             reaches further back and holds while policies differ little (Q(lambda) of Harutyunyan et al. 2016).
         average: the share that stays of the averaged network at each gradient step; 0 for no average.
+        average_reach: the average reaches back over about this share of all gradient steps so far, while that is less;
+            None for `average` from the start.
         bootstrap, gradient, n_steps, weights: see `RecurrentSarsaLoss`.
         refresh: which hidden states are rolled anew when the network has changed: "all", those of running episodes and
             those that kept rollouts begin with; "running"; or "none", where states are carried on.
@@ -63,12 +65,13 @@ class RecurrentQSARSA(RecurrentQAgent):
         n_batches: int = 16,
         importance: bool = True,
         average: float = 0.99,
+        average_reach: float | None = None,
         bootstrap: Bootstrap = "expected",
         gradient: Gradient = "semi",
         n_steps: int | None = None,
         weights: float | list[float] = 0.95,
         refresh: Refresh = "all",
-        temperature: float = 0.05,
+        temperature: float | str = 0.05,
         auxiliary: Mapping[str, Mapping[str, Any]] | None = None,
         **shared: Any,
     ) -> None:
@@ -77,6 +80,7 @@ class RecurrentQSARSA(RecurrentQAgent):
             "n_batches": n_batches,
             "importance": importance,
             "average": average,
+            "average_reach": average_reach,
             "bootstrap": bootstrap,
             "gradient": gradient,
             "n_steps": n_steps,
@@ -95,7 +99,9 @@ class RecurrentQSARSA(RecurrentQAgent):
             )
         self._rollouts: list[TensorDict] = []
         super().__init__(task, seed, temperature=temperature, **shared)
-        self._average = AveragedParams(self.loss, "value_network", average) if average > 0.0 else None
+        self._average = None
+        if average > 0.0:
+            self._average = AveragedParams(self.loss, "value_network", average, average_reach)
 
     def make_loss(self) -> RecurrentSarsaLoss:
         """See `RecurrentQAgent.make_loss`."""

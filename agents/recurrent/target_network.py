@@ -18,24 +18,33 @@ class Updater(Protocol):
 
 
 class AveragedParams:
-    """theta' <- eps theta' + (1 - eps) theta from theta' = theta on, in one call for all parameters.
+    """theta' <- eps_t theta' + (1 - eps_t) theta from theta' = theta on, in one call for all parameters.
 
-    It is TorchRL's SoftUpdate, which goes by each tensor. Buffers are not averaged.
+        eps_t = min(eps, 1 - 1 / (1 + c t)), t = 1, 2, ..: back over about the share c of all steps so far, while young
+
+    Without c it is TorchRL's SoftUpdate, which goes by each tensor. Buffers are not averaged.
 
     Args:
         loss: that holds both. name: of the network. eps: the share that stays, from 0 to below 1.
+        reach: c, above 0; None for eps from the start.
+
+    Attributes:
+        n_steps: t.
 
     Raises:
         ValueError: a share out of range.
     """
 
-    def __init__(self, loss: LossModule, name: str, eps: float) -> None:
-        if not 0.0 <= eps < 1.0:
-            raise ValueError(f"expected the share of the average that stays from 0 to below 1, got {eps}")
+    def __init__(self, loss: LossModule, name: str, eps: float, reach: float | None = None) -> None:
+        if not 0.0 <= eps < 1.0 or (reach is not None and reach <= 0.0):
+            raise ValueError(
+                "expected the share of the average that stays from 0 to below 1 and a reach above 0 (or None), got "
+                f"{eps} and {reach}"
+            )
         loss._has_update_associated[name] = True  # or the loss warns that nothing moves its target
         self.source: TensorDictBase = getattr(loss, f"{name}_params")
         self.target: TensorDictBase = getattr(loss, f"target_{name}_params")
-        self.eps = eps
+        self.eps, self.reach, self.n_steps = eps, reach, 0
         self._pairs: tuple[list[Tensor], list[Tensor]] | None = None
         for key, value in self.target.items(include_nested=True, leaves_only=True):
             value.data.copy_(self.source.get(key).data)
@@ -50,7 +59,11 @@ class AveragedParams:
                 [self.target.get(key).data for key in keys],
                 [self.source.get(key).data for key in keys],
             )
-        torch._foreach_lerp_(*self._pairs, 1.0 - self.eps)
+        self.n_steps += 1
+        fresh = 1.0 - self.eps
+        if self.reach is not None:
+            fresh = max(fresh, 1.0 / (1.0 + self.reach * self.n_steps))
+        torch._foreach_lerp_(*self._pairs, fresh)
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_pairs": None}

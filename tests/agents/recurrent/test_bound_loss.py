@@ -133,7 +133,21 @@ def test_the_average_moves_as_torchrl_moves_it(eps):
         assert torch.allclose(value.data, expected.get(key).data, rtol=1e-12), key
 
 
-@pytest.mark.parametrize("eps", [-0.1, 1.0])
-def test_a_share_out_of_range_is_told(eps):
+def test_a_young_average_reaches_back_over_a_share_of_all_steps():
+    loss = new_loss()
+    average = AveragedParams(loss, "value_network", 0.9, reach=0.5)
+    key = ("encoder", "embed", "0", "bias")
+    expected = loss.value_network_params.get(key).data.clone()
+    for t in range(1, 41):
+        shift(loss, t, names=("value_network_params",))
+        average.step()
+        eps = min(0.9, 1.0 - 1.0 / (1.0 + 0.5 * t))
+        assert eps == 0.9 or t < 18
+        expected = eps * expected + (1.0 - eps) * loss.value_network_params.get(key).data
+        assert torch.allclose(loss.target_value_network_params.get(key), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("eps", "reach"), [(-0.1, None), (1.0, None), (0.9, 0.0)])
+def test_a_share_out_of_range_is_told(eps, reach):
     with pytest.raises(ValueError, match="from 0 to below 1"):
-        AveragedParams(new_loss(), "value_network", eps)
+        AveragedParams(new_loss(), "value_network", eps, reach)
