@@ -34,6 +34,7 @@ REPRODUCTIONS = {
     "hints-attitude": "beliefgym.scripts.reproductions.hints_tables:attitude",
     "hints-mass": "beliefgym.scripts.reproductions.hints_tables:mass",
     "actions-interventions": "beliefgym.scripts.reproductions.actions_interventions:run",
+    "recurrent-returns": "beliefgym.scripts.reproductions.recurrent_returns:run",
     "recurrent-hypotheses": "beliefgym.scripts.reproductions.recurrent_hypotheses:run",
 }
 

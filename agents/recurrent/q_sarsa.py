@@ -61,17 +61,18 @@ class RecurrentQSARSA(RecurrentQAgent):
         task: Task | str,
         seed: int = 0,
         *,
-        reuse: int = 32,
+        n_envs: int = 16,
+        reuse: int = 16,
         n_batches: int = 16,
         importance: bool = True,
-        average: float = 0.99,
-        average_reach: float | None = None,
+        average: float = 0.999,
+        average_reach: float | None = 0.05,
         bootstrap: Bootstrap = "expected",
         gradient: Gradient = "semi",
         n_steps: int | None = None,
-        weights: float | list[float] = 0.95,
+        weights: float | list[float] = 0.97,
         refresh: Refresh = "all",
-        temperature: float | str = 0.05,
+        temperature: float | str = 0.1,
         auxiliary: Mapping[str, Mapping[str, Any]] | None = None,
         **shared: Any,
     ) -> None:
@@ -98,7 +99,7 @@ class RecurrentQSARSA(RecurrentQAgent):
                 'bootstrap="expected", or reuse=1'
             )
         self._rollouts: list[TensorDict] = []
-        super().__init__(task, seed, temperature=temperature, **shared)
+        super().__init__(task, seed, n_envs=n_envs, temperature=temperature, **shared)
         self._average = None
         if average > 0.0:
             self._average = AveragedParams(self.loss, "value_network", average, average_reach)

@@ -122,7 +122,9 @@ def test_moments_are_those_of_all_observations_so_far_in_every_network():
 
 
 def test_the_acting_network_is_the_running_average_of_the_fitted_ones():
-    agent = Watched(BALANCE, 0, **{**SMALL, "average": 0.75, "reuse": 1, "n_batches": 1})
+    agent = Watched(
+        BALANCE, 0, **{**SMALL, "average": 0.75, "average_reach": None, "reuse": 1, "n_batches": 1}
+    )
     average = {key: value.clone() for key, value in agent.network.named_parameters()}
     for _ in range(4):
         agent.learn(16)
