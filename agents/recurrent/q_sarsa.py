@@ -4,11 +4,12 @@
              act with pi_{i+1}(x) = arg max_a Q^{pi_i}(h_t, a) (Eq. 4.18), softened: soft-max and epsilon
              fit Q to the Bellman residuals of what was recorded (Eq. 4.17), by gradients through time
 
-What is new against the thesis proposal, and why. The network that acts and that targets are taken from is an average
-of the fitted ones over the last gradient steps (`average`), and the arg max is softened (`temperature`): policies then
-change slowly, while every one of them is learned about. Rollouts of older policies are used again (`reuse`), weighted
-by min(1, pi / mu) at each step; the proposal names that as an option. `average=0`, `temperature=0`, `reuse=1`,
-`bootstrap="taken"` and `gradient="residual"` is the proposal to the letter.
+What is new against the thesis proposal, and why. The arg max is softened (`temperature`), each policy is held near the
+one before (`munchausen`), and the network that acts and that targets are taken from is an average of the fitted ones
+over the last gradient steps (`average`): policies then change slowly, while every one of them is learned about.
+Rollouts of older policies are used again (`reuse`), weighted by min(1, pi / mu) at each step; the proposal names that
+as an option. `average=0`, `temperature=0`, `reuse=1`, `bootstrap="taken"` and `gradient="residual"` is the proposal to
+the letter.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         average: the share that stays of the averaged network at each gradient step; 0 for no average.
         average_reach: the average reaches back over about this share of all gradient steps so far, while that is less;
             None for `average` from the start.
+        munchausen: alpha of `RecurrentSarsaLoss`; None for 0.9 with bootstrap "expected" and gradient "semi", else 0.
         bootstrap, gradient, n_steps, weights: see `RecurrentSarsaLoss`.
         refresh: which hidden states are rolled anew when the network has changed: "all", those of running episodes and
             those that kept rollouts begin with; "running"; or "none", where states are carried on.
@@ -65,6 +67,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         reuse: int = 16,
         n_batches: int = 16,
         importance: bool = True,
+        munchausen: float | None = None,
         average: float = 0.999,
         average_reach: float | None = 0.05,
         bootstrap: Bootstrap = "expected",
@@ -72,7 +75,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         n_steps: int | None = None,
         weights: float | list[float] = 0.97,
         refresh: Refresh = "all",
-        temperature: float | str = 0.1,
+        temperature: float | str = 0.3,
         auxiliary: Mapping[str, Mapping[str, Any]] | None = None,
         **shared: Any,
     ) -> None:
@@ -80,6 +83,9 @@ class RecurrentQSARSA(RecurrentQAgent):
             "reuse": reuse,
             "n_batches": n_batches,
             "importance": importance,
+            "munchausen": 0.9 * ((bootstrap, gradient) == ("expected", "semi"))
+            if munchausen is None
+            else munchausen,
             "average": average,
             "average_reach": average_reach,
             "bootstrap": bootstrap,
@@ -115,6 +121,7 @@ class RecurrentQSARSA(RecurrentQAgent):
             bootstrap=own["bootstrap"],
             gradient=own["gradient"],
             importance=own["importance"] and own["reuse"] > 1,
+            munchausen=own["munchausen"],
             delay_value=own["average"] > 0.0,
             auxiliary=self._objectives(own["auxiliary"]),
         )

@@ -6,7 +6,14 @@
 Q_t depends on all that was seen up to t through the network's hidden state, which is rolled along the recorded episode:
 the actions in it are those that were taken, so the states are those that the policy was in (temporal consistency).
 
-Reference: thesis proposal, Sec. 4.3.1, Eq. 4.17 and Fig. 4.4; Munos et al. 2016 for the weights of old batches.
+With munchausen alpha > 0 policies change little from one to the next:
+
+    r_t <- r_t + alpha tau log pi(a_t | h_t)        V_t = sum_a pi(a | h_t) [Q_t(x_t, a) - tau log pi(a | h_t)]
+
+which keeps each near the one before (by a divergence of weight alpha tau) and averages errors of Q over iterations.
+
+Reference: thesis proposal, Sec. 4.3.1, Eq. 4.17 and Fig. 4.4; Munos et al. 2016 for the weights of old batches;
+Vieillard et al. 2020 for munchausen, their Eqs. 1 and 2.
 """
 
 from __future__ import annotations
@@ -33,6 +40,7 @@ from beliefgym.agents.recurrent.targets import (
     step_weights,
 )
 
+LEAST_PROBABILITY = 1e-12  # whose logarithm stands for that of 0
 Bootstrap = Literal["taken", "expected", "max", "double"]
 Gradient = Literal["semi", "residual"]
 
@@ -57,6 +65,7 @@ class RecurrentSarsaLoss(BoundLoss):
         epsilon, temperature: of the policy whose values are learned; plain attributes, to be annealed.
         importance: weight what follows a step by min(1, pi(a | h) / mu(a | h)), mu from "action_probability": for
             batches of older policies. It needs `bootstrap="expected"`.
+        munchausen: alpha, from 0 to below 1; it needs `bootstrap="expected"` and a semi-gradient.
         delay_value: bootstrap with target parameters (TorchRL's `SoftUpdate` or `HardUpdate` moves them).
         burn_in: steps at the front of a piece that begins inside an episode that bring up its state, without residuals
             (auxiliary objectives count there too).
@@ -103,6 +112,7 @@ class RecurrentSarsaLoss(BoundLoss):
         epsilon: float = 0.0,
         temperature: float = 0.0,
         importance: bool = False,
+        munchausen: float = 0.0,
         delay_value: bool = False,
         burn_in: int = 0,
         auxiliary: Mapping[str, nn.Module] | None = None,
@@ -110,11 +120,17 @@ class RecurrentSarsaLoss(BoundLoss):
     ) -> None:
         super().__init__()
         _check(gamma, n_steps, weights, bootstrap, gradient, importance, delay_value)
+        if not 0.0 <= munchausen < 1.0 or (munchausen and (bootstrap, gradient) != ("expected", "semi")):
+            raise ValueError(
+                'expected munchausen from 0 to below 1, and above 0 with bootstrap="expected" and gradient="semi", got '
+                f"{munchausen} with {bootstrap!r} and {gradient!r}"
+            )
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
         self.gamma, self.n_steps, self.weights = gamma, n_steps, weights
         self.bootstrap, self.gradient = bootstrap, gradient
         self.epsilon, self.temperature = epsilon, temperature
-        self.importance, self.delay_value, self.burn_in = importance, delay_value, burn_in
+        self.importance, self.munchausen = importance, munchausen
+        self.delay_value, self.burn_in = delay_value, burn_in
         self.auxiliary = nn.ModuleDict(dict(auxiliary or {}))
         self.auxiliary_weights = {
             name: float((auxiliary_weights or {}).get(name, 1.0)) for name in self.auxiliary
@@ -153,6 +169,9 @@ class RecurrentSarsaLoss(BoundLoss):
         rewards = pieces.steps(tensordict.get(("next", keys.reward))[..., 0])
         terminated = pieces.steps(tensordict.get(("next", keys.terminated))[..., 0])
         discounts = self.gamma * (~terminated).to(rewards.dtype)
+        if self.munchausen:
+            bonus = self.temperature * _of(self._log_policy(later[:, :-1]), action)
+            rewards = rewards + self.munchausen * bonus
         chosen = _of(values[:, :-1], action)
         probability = tensordict.get(keys.action_probability, None)
         loss = self._residuals(
@@ -225,6 +244,16 @@ class RecurrentSarsaLoss(BoundLoss):
     def _policy(self, values: Tensor) -> Tensor:
         return action_probabilities(values, self.epsilon, self.temperature)
 
+    def _log_policy(self, values: Tensor) -> Tensor:
+        return self._policy(values).clamp(min=LEAST_PROBABILITY).log()
+
+    def _expected(self, values: Tensor) -> Tensor:
+        """V of the policy, with its entropy where munchausen rewards it."""
+        policy = self._policy(values)
+        if self.munchausen:
+            values = values - self.temperature * policy.clamp(min=LEAST_PROBABILITY).log()
+        return (policy * values).sum(-1)
+
     def _following(self, pieces: Segments, action: Tensor, values: Tensor, later: Tensor) -> Tensor:
         """V_{t+1} at every step."""
         following = later[:, 1:]
@@ -232,7 +261,7 @@ class RecurrentSarsaLoss(BoundLoss):
             return following.max(-1).values
         if self.bootstrap == "double":
             return _of(following, values[:, 1:].detach().argmax(-1))
-        expected = (self._policy(following) * following).sum(-1)
+        expected = self._expected(following)
         if self.bootstrap == "expected":
             return expected
         taken = _of(following[:, :-1], action[:, 1:])
@@ -287,8 +316,7 @@ class RecurrentSarsaLoss(BoundLoss):
     @torch.no_grad()
     def _returns(self, pieces: Segments, rewards: Tensor, discounts: Tensor, later: Tensor) -> Tensor:
         """The discounted rewards to the end of each piece, and the policy's value there."""
-        following = later[:, 1:]
-        expected = (self._policy(following) * following).sum(-1)
+        expected = self._expected(later[:, 1:])
         carried = (~pieces.is_last).to(rewards.dtype)
         return lambda_returns(rewards, discounts, expected, carried, expected)
 

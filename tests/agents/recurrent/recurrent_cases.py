@@ -143,12 +143,17 @@ def piece_loss(
     weights: Any,
     bootstrap: str,
     importance: bool = False,
+    munchausen: float = 0.0,
+    temperature: float = 0.0,
 ) -> list[Tensor]:
     """l_t of every step, by the sums that define it. `later` are the values that targets are taken from."""
     row, begin, end = piece
     n = end - begin
     action, reward = rollout["action"][row, begin:end].tolist(), rollout["next", "reward"][row, begin:end, 0]
     over = bool(rollout["next", "terminated"][row, end - 1])
+    if munchausen:
+        logs = [policy(later[t]).log()[action[t]] for t in range(n)]
+        reward = reward + munchausen * temperature * torch.stack(logs)
 
     def value_after(t: int) -> Any:
         if over and t == n - 1:
@@ -158,7 +163,9 @@ def piece_loss(
         if bootstrap == "double":
             return later[t + 1][q[t + 1].argmax()]
         if bootstrap == "expected" or t == n - 1:
-            return (policy(later[t + 1]) * later[t + 1]).sum()
+            share = policy(later[t + 1])
+            entropy = -(share * share.log()).sum() if munchausen else 0.0
+            return (share * later[t + 1]).sum() + temperature * entropy
         return later[t + 1][action[t + 1]]
 
     def target(t: int, steps: int) -> Any:
@@ -217,6 +224,7 @@ def loss_by_loop(
     for piece in pieces_by_loop(rollout["is_init"][..., 0], mask):
         q, _ = values_along(network, rollout, piece)
         later = q if target is None else values_along(target, rollout, piece)[0]
+        form["temperature"] = temperature if form.get("munchausen") else 0.0
         steps = piece_loss(
             q,
             rollout,

@@ -5,11 +5,11 @@ import pickle
 
 import pytest
 import torch
+from recurrent_cases import made_up_rollout, q_network
 from torchrl.objectives import SoftUpdate
 
 from beliefgym.agents.recurrent.sarsa_loss import RecurrentSarsaLoss
 from beliefgym.agents.recurrent.target_network import AveragedParams
-from tests.agents.recurrent.recurrent_cases import made_up_rollout, q_network
 
 BATCH = made_up_rollout()
 

@@ -70,6 +70,32 @@ def test_targets_of_a_network_of_their_own_follow_its_policy(form, bootstrap, po
     assert abs(found - by_loop(network, rollout, bootstrap=bootstrap, **policy, **form)) > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("form", "importance"), [*((form, False) for form in FORMS.values()), (FORMS["lambda"], True)], ids=str
+)
+def test_munchausen_rewards_what_the_policy_would_do_and_its_entropy(form, importance):
+    network = q_network("gru")
+    rollout = made_up_rollout(state_size=5)
+    rollout["action_probability"] = 0.1 + 0.9 * torch.rand(
+        rollout.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+    )
+    options = {"epsilon": 0.1, "temperature": 0.4, "importance": importance, **form}
+    loss = loss_of(network, bootstrap="expected", munchausen=0.9, delay_value=True, **options)
+    target = apart(loss, "gru")
+    found = loss(rollout)["loss_value"]
+    more = {"target": target, "bootstrap": "expected", **options}
+    expected = by_loop(network, rollout, munchausen=0.9, **more)
+    assert_close(found, expected, **TOLD)
+    assert_close(gradient(found, network), gradient(expected, network), **TOLD)
+    assert abs(found - by_loop(network, rollout, **more)) > 1e-3
+
+
+def test_munchausen_of_an_arg_max_changes_nothing():
+    network, rollout = q_network(), made_up_rollout()
+    plain, other = (loss_of(network, bootstrap="expected", munchausen=m) for m in (0.0, 0.9))
+    assert torch.equal(plain(rollout)["loss_value"], other(rollout)["loss_value"])
+
+
 def test_policy_settings_may_be_changed_between_calls():
     network = q_network("gru")
     rollout = made_up_rollout(state_size=5)

@@ -175,6 +175,9 @@ def test_keys_may_have_other_names():
         ({"importance": True}, 'take bootstrap="expected"'),
         ({"importance": True, "bootstrap": "expected", "n_steps": 1}, "n_steps=None"),
         ({"importance": True, "bootstrap": "expected", "gradient": "residual"}, 'gradient="semi"'),
+        ({"munchausen": 0.9}, """above 0 with bootstrap="expected" .* got 0.9 with 'taken'"""),
+        ({"munchausen": 0.9, "bootstrap": "expected", "gradient": "residual"}, "'residual'"),
+        ({"munchausen": 1.0, "bootstrap": "expected"}, "from 0 to below 1"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(options, message):
