@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefgym.agents.agent import HEADER, Agent, read_archive
-from beliefgym.agents.hyperparameters import action_bins, hyperparameters
+from beliefgym.agents.hyperparameters import action_bins, hyperparameters, recurrent_q
 from beliefgym.wrappers.task import Task
 
 GROUP = "beliefgym.agents"
@@ -167,7 +167,7 @@ def _delays(env_id: str) -> dict[str, Any]:
 
 
 def _recurrent_q(env_id: str) -> dict[str, Any]:
-    return {**action_bins(env_id), "auxiliary": {"predictive_state": {"weight": 1.0, "k": 5}}}
+    return {**recurrent_q(env_id), "auxiliary": {"predictive_state": {"weight": 1.0, "k": 5}}}
 
 
 _SB3 = "beliefgym.agents.sb3_agent:SB3Agent"

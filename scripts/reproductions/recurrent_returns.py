@@ -110,8 +110,8 @@ def run(request: Request) -> Report:
         if aim.scale != 1.0:
             for kind in ("LQR", "tuned"):
                 cells[f"{slug}--kalman-{kind.lower()}"] = _reference(aim, kind)
-    for seed in seeds:
-        cells |= {f"{slug}--{seed}": _cell(aim, seed) for slug, aim in AIMS.items()}
+    for slug, aim in AIMS.items():
+        cells |= {f"{slug}--{seed}": _cell(aim, seed) for seed in seeds}
     module = "beliefgym.scripts.reproductions.recurrent_returns"
     done = run_cells(f"{module}:cell", cells, request.folder / "cells" / NAME, request.jobs, request.told)
     failed = [f"Failed: {name}: {result['failed']}" for name, result in done.items() if "failed" in result]
