@@ -2,8 +2,9 @@
 
 Recurrent-Q SARSA against sb3-contrib's RecurrentPPO on the position-only cart-pole: the same memory (LSTM of 64), the
 same copies, and the same gradient work: every frame goes through the network's gradient 10 times, in batches of 128
-frames. RecurrentPPO has an LSTM for the actor and one for the critic; a second rival has the actor's alone. With one
-thread and with two. Beside them, the agents here with the settings that they are registered with.
+frames (RecurrentPPO's default) and of 512. RecurrentPPO has an LSTM for the actor and one for the critic; a second
+rival has the actor's alone. With one thread and with two. Beside them, the agents here with the settings that they are
+registered with, against RecurrentPPO in batches of 128.
 
 A frame costs an LSTM of h units with i inputs 8 h (i + h) FLOPs forwards and twice that backwards.
 """
@@ -25,12 +26,12 @@ from beliefgym.wrappers.sb3 import SB3VecEnv
 from beliefgym.wrappers.task import Task
 
 TASK = "CartPoleBalancePosition-v0"
-N_ENVS, HIDDEN, BATCH, EPOCHS = 8, 64, 128, 10
+N_ENVS, HIDDEN, EPOCHS = 8, 64, 10
+BATCHES = (128, 512)  # frames in a gradient step
 PPO_STEPS, Q_STEPS = 128, 32  # of a rollout
 TARGET = 20.0
 REPEATS, SECONDS = 3, 2.0
-OURS, OURS_PLAIN = "Recurrent-Q SARSA", "Recurrent-Q SARSA without an averaged network"
-RIVAL, RIVAL_SMALL = f"RecurrentPPO, two LSTMs of {HIDDEN}", f"RecurrentPPO, one LSTM of {HIDDEN}"
+OURS, RIVAL, RIVAL_SMALL = "Recurrent-Q SARSA", "RecurrentPPO, two LSTMs", "RecurrentPPO, one LSTM"
 REGISTERED = ("recurrent-q", "recurrent-pqn", "drqn", "r2d2")
 
 
@@ -48,13 +49,15 @@ def run(told: Callable[[str], None]) -> tuple[list[dict[str, Any]], dict[str, An
     limits: dict[str, Any] = {
         "GFLOP/s": {"matrix product (dgemm 1000 x 1000)": product_rate() / 1e9},
         "FLOPs of the LSTM for a frame": {"acting": forward, "learning": 3.0 * forward * EPOCHS},
-        "gradient steps for 1,024 frames": 1024 * EPOCHS / BATCH,
+        "gradient steps for 1,024 frames": {
+            f"batches of {batch}": 1024 * EPOCHS / batch for batch in BATCHES
+        },
     }
     return rows, limits
 
 
-def equal_work(**options: Any) -> RecurrentQSARSA:
-    """The agent with as much gradient work for a frame as RecurrentPPO: `EPOCHS` uses in batches of `BATCH` frames."""
+def equal_work(batch: int) -> RecurrentQSARSA:
+    """The agent with as much gradient work for a frame as RecurrentPPO: `EPOCHS` uses in batches of so many frames."""
     frames = N_ENVS * Q_STEPS
     return RecurrentQSARSA(
         TASK,
@@ -64,45 +67,51 @@ def equal_work(**options: Any) -> RecurrentQSARSA:
         hidden_size=HIDDEN,
         width=HIDDEN,
         reuse=EPOCHS,
-        n_batches=frames * EPOCHS // BATCH,
-        **options,
+        n_batches=frames * EPOCHS // batch,
+    )
+
+
+def recurrent_ppo(batch: int, critic_lstm: bool) -> RecurrentPPO:
+    """The rival, with SB3's rollouts of the same copies."""
+    policy = {"net_arch": [HIDDEN], "lstm_hidden_size": HIDDEN, "enable_critic_lstm": critic_lstm}
+    return RecurrentPPO(
+        "MlpLstmPolicy",
+        _env(),
+        n_steps=PPO_STEPS,
+        batch_size=batch,
+        n_epochs=EPOCHS,
+        policy_kwargs=policy,
+        device="cpu",
+        seed=0,
     )
 
 
 def _training(threads: int) -> list[dict[str, Any]]:
-    alike: dict[str, Any] = {
-        "n_steps": PPO_STEPS,
-        "batch_size": BATCH,
-        "n_epochs": EPOCHS,
-        "device": "cpu",
-        "seed": 0,
-    }
-    policy: dict[str, Any] = {"net_arch": [HIDDEN], "lstm_hidden_size": HIDDEN}
-    models: dict[str, Any] = {
-        OURS: equal_work(),
-        OURS_PLAIN: equal_work(average=0.0),
-        RIVAL: RecurrentPPO("MlpLstmPolicy", _env(), policy_kwargs=policy, **alike),
-        RIVAL_SMALL: RecurrentPPO(
-            "MlpLstmPolicy", _env(), policy_kwargs={**policy, "enable_critic_lstm": False}, **alike
-        ),
-    }
+    models: dict[str, Any] = {}
+    for batch in BATCHES:
+        models[_of(OURS, batch)] = equal_work(batch).learn(
+            EPOCHS * N_ENVS * Q_STEPS
+        )  # as many rollouts as it keeps
+        models[_of(RIVAL, batch)] = recurrent_ppo(batch, critic_lstm=True)
+        models[_of(RIVAL_SMALL, batch)] = recurrent_ppo(batch, critic_lstm=False)
     for name in REGISTERED:
         models[name] = make_agent(name, TASK, seed=0)
     frames = N_ENVS * PPO_STEPS
-    for name in (OURS, OURS_PLAIN):
-        models[name].learn(EPOCHS * N_ENVS * Q_STEPS)  # until as many rollouts are kept as will be
-    found = rates(
-        {name: _learning(model, frames) for name, model in models.items()}, repeats=REPEATS, seconds=SECONDS
-    )
+    calls = {name: _learning(model, frames) for name, model in models.items()}
+    found = rates(calls, repeats=REPEATS, seconds=SECONDS)
+    what = f"training frames/s, {TASK}, {threads} threads: "
     rows = []
-    for name in models:
-        if name in (RIVAL, RIVAL_SMALL):
-            continue
-        what = f"training frames/s, {TASK}, {threads} threads: {name}"
-        rows.append(row(what, found[name], RIVAL, found[RIVAL], TARGET if name == OURS else None))
-        if name == OURS:
-            rows.append(row(what, found[name], RIVAL_SMALL, found[RIVAL_SMALL]))
+    for batch in BATCHES:
+        ours = _of(OURS, batch)
+        for rival, target in ((_of(RIVAL, batch), TARGET), (_of(RIVAL_SMALL, batch), None)):
+            rows.append(row(what + ours, found[ours], rival, found[rival], target))
+    usual = _of(RIVAL, BATCHES[0])
+    rows += [row(what + name, found[name], usual, found[usual]) for name in REGISTERED]
     return rows
+
+
+def _of(name: str, batch: int) -> str:
+    return f"{name}, batches of {batch}"
 
 
 def _env() -> SB3VecEnv:

@@ -31,6 +31,7 @@ TEST_SEED, TEST_EPISODES = 1_000_000, 300
 TUNING_SEED, TUNING_EPISODES = 4_000_000, 100
 CURVE_POINTS, CURVE_EPISODES = 40, 20
 FULL_FORCE = 100.0  # a gain so large that every mean but the smallest asks for full force
+SEARCH = {"popsize": 8, "maxiter": 8}  # of the best gain
 SOLVED_BEFORE = 50_000  # environment steps
 
 
@@ -180,8 +181,7 @@ def _kalman(task: Task, tuned: bool) -> dict[str, Any]:
         found = differential_evolution(
             lambda k: -float(controlled([k[0], k[1], 1.0, k[2]], TUNING_SEED, TUNING_EPISODES).mean()),
             bounds=[(-0.5, 0.5), (-0.5, 0.5), (0.0, 1.0)],
-            popsize=8,
-            maxiter=8,
+            **SEARCH,
             polish=False,
             rng=0,
         )
