@@ -36,7 +36,7 @@ class RecurrentQAgent(RecurrentAgent):
         previous_actions, previous_rewards: what the network is told besides observations. With rewards, `predict`
             has to be told them (`tell_reward`).
         gamma: discount.
-        learning_rate: a number, or "linear:1e-3" for one that falls to 0.
+        learning_rate: a number, or "linear:1e-3" or "cubic:1e-3" for one that falls to 0.
         max_grad_norm: gradients are scaled down to it.
         epsilon: share of random actions at the start, at the end, and the share of training over which it falls.
         temperature: of the soft-max policy, in units of scaled rewards; "linear:0.1" falls to 0, which is arg max.

@@ -37,7 +37,9 @@ class RecurrentQSARSA(RecurrentQAgent):
     Args:
         task, seed: see `RecurrentQAgent`, which takes all further arguments.
         reuse: rollouts that are learned from at a time, the newest among them.
-        n_batches: gradient steps after each rollout; together they go once through what is kept.
+        n_batches: gradient steps after each rollout.
+        batch_rows: rows (of `rollout_steps` steps) in each of them; None for what is kept divided among them, so that
+            together they go once through it.
         importance: cut what followed a step of an older policy by min(1, pi / mu) (Retrace); False cuts nothing, which
             reaches further back and holds while policies differ little (Q(lambda) of Harutyunyan et al. 2016).
         average: the share that stays of the averaged network at each gradient step; 0 for no average.
@@ -66,6 +68,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         n_envs: int = 16,
         reuse: int = 16,
         n_batches: int = 16,
+        batch_rows: int | None = None,
         importance: bool = True,
         munchausen: float | None = None,
         average: float = 0.999,
@@ -75,6 +78,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         n_steps: int | None = None,
         weights: float | list[float] = 0.97,
         refresh: Refresh = "all",
+        learning_rate: float | str = "cubic:2e-3",
         temperature: float | str = 0.3,
         auxiliary: Mapping[str, Mapping[str, Any]] | None = None,
         **shared: Any,
@@ -82,6 +86,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         self._own: dict[str, Any] = {
             "reuse": reuse,
             "n_batches": n_batches,
+            "batch_rows": batch_rows,
             "importance": importance,
             "munchausen": 0.9 * ((bootstrap, gradient) == ("expected", "semi"))
             if munchausen is None
@@ -95,8 +100,10 @@ class RecurrentQSARSA(RecurrentQAgent):
             "refresh": refresh,
             "auxiliary": {name: dict(options) for name, options in (auxiliary or {}).items()},
         }
-        if reuse < 1 or n_batches < 1:
-            raise ValueError(f"expected reuse and n_batches of at least 1, got {reuse} and {n_batches}")
+        if min(reuse, n_batches, 1 if batch_rows is None else batch_rows) < 1:
+            raise ValueError(
+                f"expected reuse, n_batches and batch_rows of at least 1, got {reuse}, {n_batches} and {batch_rows}"
+            )
         if refresh not in ("all", "running", "none"):
             raise ValueError(f'expected refresh "all", "running" or "none", got {refresh!r}')
         if reuse > 1 and bootstrap == "taken":
@@ -105,7 +112,9 @@ class RecurrentQSARSA(RecurrentQAgent):
                 'bootstrap="expected", or reuse=1'
             )
         self._rollouts: list[TensorDict] = []
-        super().__init__(task, seed, n_envs=n_envs, temperature=temperature, **shared)
+        super().__init__(
+            task, seed, n_envs=n_envs, learning_rate=learning_rate, temperature=temperature, **shared
+        )
         self._average = None
         if average > 0.0:
             self._average = AveragedParams(self.loss, "value_network", average, average_reach)
@@ -141,6 +150,8 @@ class RecurrentQSARSA(RecurrentQAgent):
         told = {"kept_state_drift": self._refresh_kept()} if self._own["refresh"] == "all" else {}
         rows = torch.cat(self._rollouts) if len(self._rollouts) > 1 else rollout
         order = torch.randperm(len(rows), generator=self._random)
+        if self._own["batch_rows"] is not None:
+            order = order[: self._own["batch_rows"] * self._own["n_batches"]]
         for chosen in order.tensor_split(min(self._own["n_batches"], len(rows))):
             answer = self.step_optimizer(rows[chosen])
             if self._average is not None:

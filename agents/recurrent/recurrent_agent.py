@@ -27,6 +27,7 @@ from beliefgym.agents.training_callback import TrainingCallback
 from beliefgym.wrappers.task import Task
 
 FILE = "networks.safetensors"
+MOMENTS_SHARE = 0.15  # of a training, over which moments of observations are taken
 
 
 class DivergenceError(FloatingPointError):
@@ -43,6 +44,10 @@ class Remembered(NamedTuple):
 
 class RecurrentAgent(Agent):
     """Base class; a subclass builds networks, `loss` and `optimizer`, and says how it acts and learns.
+
+    Observations are standardised by the moments of those of the first `MOMENTS_SHARE` of a training. Then the moments
+    stay: as they went on, they would change what networks make of the same history, and a network that no longer
+    learns fast would not follow.
 
     Args:
         task, seed: see `Agent`; with a flat Box of observations.
@@ -261,8 +266,9 @@ class RecurrentAgent(Agent):
         if collector.reward_scale != self._reward_scale:
             collector.rescale(self._reward_scale, rollout)
         self._largest_reward = max(self._largest_reward, float(rollout["next", "reward"].abs().max()))
-        self._moments.add(rollout["observation"].flatten(0, 1).numpy())
-        self._set_moments()
+        if progress <= MOMENTS_SHARE:
+            self._moments.add(rollout["observation"].flatten(0, 1).numpy())
+            self._set_moments()
         told |= self.improve(rollout, progress)
         steps = rollout.numel()
         self.num_timesteps += steps

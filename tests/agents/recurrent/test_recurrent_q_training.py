@@ -110,15 +110,26 @@ def test_states_are_refreshed_as_far_as_asked(scripted):
         watched(scripted, refresh="some")
 
 
-def test_moments_are_those_of_all_observations_so_far_in_every_network():
-    agent = watched()
-    seen = torch.cat([r["observation"].flatten(0, 1) for r in agent.rollouts]).double().numpy()
+def test_moments_are_those_of_the_first_observations_in_every_network():
+    agent = watched()  # ten rollouts, of which two begin within the first 15 %
+    seen = torch.cat([r["observation"].flatten(0, 1) for r in agent.rollouts[:2]]).double().numpy()
+    assert len(agent.rollouts) == 10
     for moments in (agent.network.encoder, agent.acting.encoder):
         np.testing.assert_allclose(moments.mean, seen.mean(0), rtol=1e-5)  # single precision
         np.testing.assert_allclose(moments.scale, seen.std(0), rtol=1e-5)
     target = agent.loss.target_value_network_params["encoder"]
     assert torch.equal(target["mean"], agent.network.encoder.mean)
     assert torch.equal(target["scale"], agent.network.encoder.scale)
+
+
+def test_moments_of_a_further_training_join_those_of_the_first():
+    agent = watched(steps=16)
+    seen = [agent.rollouts[0]]
+    agent.learn(160)
+    seen += agent.rollouts[1:3]
+    rows = torch.cat([r["observation"].flatten(0, 1) for r in seen]).double().numpy()
+    np.testing.assert_allclose(agent.acting.encoder.mean, rows.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(agent.acting.encoder.scale, rows.std(0), rtol=1e-5)
 
 
 def test_the_acting_network_is_the_running_average_of_the_fitted_ones():
