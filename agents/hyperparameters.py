@@ -156,7 +156,7 @@ ACTION_BINS: dict[str, int | None] = {
 _UNDER_NOISE = {"n_envs": 32, "gamma": 0.95, "weights": 0.95, "learning_rate": "linear:1e-3"}
 RECURRENT_Q: dict[str, dict[str, Any]] = {
     "": {},
-    "Pendulum": {"gamma": 0.95, "weights": 0.95},
+    "Pendulum": {"gamma": 0.95, "weights": 0.95, "learning_rate": "linear:2e-3"},
     "CartPoleBalanceNoisy": _UNDER_NOISE,
     "CartPoleBalanceNoisyEasy": {**_UNDER_NOISE, "gamma": 0.98},
 }
