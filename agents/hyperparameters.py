@@ -158,7 +158,7 @@ RECURRENT_Q: dict[str, dict[str, Any]] = {
     "": {},
     "Pendulum": {"gamma": 0.95, "weights": 0.95, "learning_rate": "linear:2e-3"},
     "CartPoleBalanceNoisy": _UNDER_NOISE,
-    "CartPoleBalanceNoisyEasy": {**_UNDER_NOISE, "gamma": 0.98},
+    "CartPoleBalanceNoisyEasy": {**_UNDER_NOISE, "gamma": 0.98, "reuse": 64, "batch_rows": 32},
 }
 
 
