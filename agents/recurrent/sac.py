@@ -226,6 +226,8 @@ class RecurrentSAC(RecurrentAgent):
         else:
             noise = torch.empty_like(mean).normal_(generator=self._random)
         action, log_probability = squashed_gaussian(mean, log_std, noise)
+        if not action.isfinite().all():
+            self._tell_divergence(float("nan"), float("nan"))
         return Acted(action[:, 0], log_probability[:, 0].exp(), state)
 
     def _act_uniformly(self, seen: Seen) -> Acted:

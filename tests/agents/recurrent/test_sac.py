@@ -255,6 +255,14 @@ def test_divergence_is_named(share):
         agent.step_optimizer(batch)
 
 
+def test_actions_that_are_not_finite_are_told_before_they_are_taken():
+    agent = small().learn(80)
+    with torch.no_grad():
+        agent.actor.head[-1].bias.fill_(np.nan)
+    with pytest.raises(DivergenceError, match="RecurrentSAC on .* has diverged at step 80"):
+        agent.predict(np.zeros((2, agent.n_observation), dtype=np.float32), deterministic=True)
+
+
 def test_discrete_actions_are_sent_to_recurrent_q_sarsa():
     with pytest.raises(ValueError, match=r"has Discrete\(2\): take RecurrentQSARSA"):
         RecurrentSAC("beliefgym/CartPoleBalancePosition-v0")
