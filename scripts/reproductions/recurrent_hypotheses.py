@@ -19,7 +19,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from beliefgym.agents import find_agent
+from beliefgym.agents import make_agent
 from beliefgym.scripts.reproductions.cells import run_cells
 from beliefgym.scripts.reproductions.dad_figures import STYLE, plain, save
 from beliefgym.scripts.reproductions.recurrent_methods import (
@@ -108,7 +108,7 @@ def run(request: Request) -> Report:
 def _cell(task: str, method: str, seed: int) -> dict[str, Any]:
     setting = SETTINGS[task]
     agent, options = METHODS[method]
-    registered = find_agent(agent).options(setting.task.env_id)
+    given = {**setting.options, **options}  # over what is registered
     return {
         "version": VERSION,
         "name": task,
@@ -116,7 +116,7 @@ def _cell(task: str, method: str, seed: int) -> dict[str, Any]:
         "task": setting.task.to_dict(),
         "steps": setting.steps,
         "agent": agent,
-        "options": {**registered, **setting.options, **options},
+        "options": make_agent(agent, setting.task, seed=seed, **given).options(),  # defaults too
         "seed": seed,
     }
 
