@@ -23,8 +23,8 @@ def rewarded():
     ("options", "message"),
     [
         ({"bootstrap": "taken"}, 'show what those did next, .* take bootstrap="expected", or reuse=1'),
-        ({"reuse": 0}, "reuse, n_batches and batch_rows of at least 1, got 0, 2 and None"),
-        ({"n_batches": 0}, "n_batches and batch_rows of at least 1, got 2, 0 and None"),
+        ({"reuse": 0}, "reuse, n_batches and batch_rows of at least 1, got 0, 2 and 32"),
+        ({"n_batches": 0}, "n_batches and batch_rows of at least 1, got 2, 0 and 32"),
         ({"batch_rows": 0}, "n_batches and batch_rows of at least 1, got 2, 2 and 0"),
         ({"gradient": "residual", "reuse": 1}, "take delay_value=False"),
         ({"auxiliary": {"rewards": {}}}, "an auxiliary objective out of"),
