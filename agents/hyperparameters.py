@@ -159,7 +159,13 @@ RECURRENT_Q: dict[str, dict[str, Any]] = {
     "": {},
     "Pendulum": {**_FEWER, "gamma": 0.95, "weights": 0.95, "learning_rate": "linear:2e-3"},
     "CartPoleBalanceNoisy": {**_UNDER_NOISE, **_FEWER},
-    "CartPoleBalanceNoisyEasy": {**_UNDER_NOISE, "gamma": 0.98, "reuse": 64, "batch_rows": 32},
+    "CartPoleBalanceNoisyEasy": {
+        **_UNDER_NOISE,
+        "gamma": 0.98,
+        "reuse": 64,
+        "reuse_reach": None,
+        "batch_rows": 32,
+    },
 }
 
 

@@ -28,6 +28,7 @@ from beliefgym.agents.recurrent.sarsa_loss import Bootstrap, Gradient, Recurrent
 from beliefgym.agents.recurrent.target_network import AveragedParams
 from beliefgym.wrappers.task import Task
 
+YOUNG_REUSE = 16  # rollouts
 Refresh = Literal["all", "running", "none"]
 
 
@@ -36,7 +37,8 @@ class RecurrentQSARSA(RecurrentQAgent):
 
     Args:
         task, seed: see `RecurrentQAgent`, which takes all further arguments.
-        reuse: rollouts that are learned from at a time, the newest among them.
+        reuse: rollouts that are learned from at a time, the newest among them. reuse_reach: at most about this share of
+            all rollouts so far where that is more than `YOUNG_REUSE`; None for no such limit.
         n_batches: gradient steps after each rollout.
         batch_rows: rows (of `rollout_steps` steps) in each of them; None for what is kept divided among them, so that
             together they go once through it.
@@ -67,6 +69,7 @@ class RecurrentQSARSA(RecurrentQAgent):
         *,
         n_envs: int = 16,
         reuse: int = 64,
+        reuse_reach: float | None = 0.25,
         n_batches: int = 16,
         batch_rows: int | None = 32,
         importance: bool = True,
@@ -85,6 +88,7 @@ class RecurrentQSARSA(RecurrentQAgent):
     ) -> None:
         self._own: dict[str, Any] = {
             "reuse": reuse,
+            "reuse_reach": reuse_reach,
             "n_batches": n_batches,
             "batch_rows": batch_rows,
             "importance": importance,
@@ -144,9 +148,7 @@ class RecurrentQSARSA(RecurrentQAgent):
     def improve(self, rollout: TensorDict, progress: float) -> dict[str, Any]:
         """Fit Q to the rollouts that are kept; see `RecurrentQAgent.improve`."""
         self.loss.auxiliary_weights = self._objective_weights(self._own["auxiliary"], progress)
-        self._rollouts = (
-            [*self._rollouts[-(self._own["reuse"] - 1) :], rollout] if self._own["reuse"] > 1 else [rollout]
-        )
+        self._rollouts = [*self._rollouts, rollout][-self._n_kept() :]
         told = {"kept_state_drift": self._refresh_kept()} if self._own["refresh"] == "all" else {}
         rows = torch.cat(self._rollouts) if len(self._rollouts) > 1 else rollout
         order = torch.randperm(len(rows), generator=self._random)
@@ -158,6 +160,14 @@ class RecurrentQSARSA(RecurrentQAgent):
                 self._average.step()
         self.sync_acting()
         return told | {key: float(value.detach()) for key, value in answer.items()}
+
+    def _n_kept(self) -> int:
+        """Rollouts to learn from, the one that has just been recorded among them."""
+        reuse, reach = self._own["reuse"], self._own["reuse_reach"]
+        if reach is None:
+            return int(reuse)
+        so_far = self.num_timesteps // (self.n_envs * self.rollout_steps) + 1
+        return int(min(reuse, max(YOUNG_REUSE, reach * so_far)))
 
     def _refresh_kept(self) -> float:
         """The states that kept rollouts begin with, as the acting network would have come to them; how far off they

@@ -110,6 +110,27 @@ def test_states_are_refreshed_as_far_as_asked(scripted):
         watched(scripted, refresh="some")
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"reuse": 3, "reuse_reach": None}, [1, 2, 3, 3, 3, 3]),
+        ({"reuse": 5, "reuse_reach": 0.5}, [1, 2, 2, 2, 2, 3]),  # half of 6
+        ({"reuse": 2, "reuse_reach": 0.9}, [1, 2, 2, 2, 2, 2]),
+        ({"reuse": 1, "reuse_reach": 0.5}, [1, 1, 1, 1, 1, 1]),
+    ],
+    ids=str,
+)
+def test_rollouts_kept_are_a_share_of_all_so_far_and_at_least_a_few(options, expected, monkeypatch):
+    monkeypatch.setattr("beliefgym.agents.recurrent.q_sarsa.YOUNG_REUSE", 2)
+    agent, kept = watched(steps=16, **options), []
+    for _ in range(6):
+        kept.append(len(agent._rollouts))
+        agent.learn(16)
+    assert kept == expected
+    newest = agent.rollouts[-1]
+    assert torch.equal(agent._rollouts[-1]["observation"], newest["observation"])
+
+
 def test_moments_are_those_of_the_first_observations_in_every_network():
     agent = watched()  # ten rollouts, of which two begin within the first 15 %
     seen = torch.cat([r["observation"].flatten(0, 1) for r in agent.rollouts[:2]]).double().numpy()
