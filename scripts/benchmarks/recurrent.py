@@ -67,6 +67,7 @@ def equal_work(batch: int) -> RecurrentQSARSA:
         hidden_size=HIDDEN,
         width=HIDDEN,
         reuse=EPOCHS,
+        batch_rows=None,
         n_batches=frames * EPOCHS // batch,
     )
 
