@@ -32,7 +32,6 @@ TUNING_SEED, TUNING_EPISODES = 4_000_000, 100
 CURVE_POINTS, CURVE_EPISODES = 40, 20
 FULL_FORCE = 100.0  # a gain so large that every mean but the smallest asks for full force
 SEARCH = {"popsize": 8, "maxiter": 8}  # of the best gain
-SOLVED_BEFORE = 50_000  # environment steps
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,8 @@ class Aim:
         title: in table and figure. env_id: the task. agent: registered name; "kalman" for the reference. steps: of
             training. target: mean return that is asked for. scale: what the return is divided by in the table.
         target_of: why that. seeds: at most so many.
+        solved_before: the target has to be reached by an evaluation before so many steps, and to be held by the test at
+            the end, in nine of ten seeds; None for the mean over seeds alone.
     """
 
     title: str
@@ -53,6 +54,7 @@ class Aim:
     scale: float = 1.0
     target_of: str = ""
     seeds: int = 10
+    solved_before: int | None = None
 
 
 def _noisy() -> dict[str, Aim]:
@@ -78,7 +80,12 @@ def _noisy() -> dict[str, Aim]:
 
 AIMS: dict[str, Aim] = {
     "cart-pole": Aim(
-        "cart-pole, positions", "beliefgym/CartPoleBalancePosition-v0", "recurrent-q", 200_000, 500.0
+        "cart-pole, positions",
+        "beliefgym/CartPoleBalancePosition-v0",
+        "recurrent-q",
+        200_000,
+        500.0,
+        solved_before=50_000,
     ),
     **_noisy(),
     "pendulum": Aim(
@@ -104,7 +111,8 @@ ABOUT = (
     f"{TEST_EPISODES} test episodes after training; means over seeds with 95 % intervals, of returns, under noise of "
     "returns divided by 200, the largest. `target`: the least mean that was asked for, in the first row 500 "
     f"at the end of every seed; `solved early`: seeds that had 500 in an evaluation of {CURVE_EPISODES} episodes "
-    f"before {SOLVED_BEFORE:,} steps. Kalman filter: of the exact model, `LQR` with the expert's gain, `tuned` with "
+    f"before {AIMS['cart-pole'].solved_before:,} steps. Kalman filter: of the exact model, `LQR` with the expert's "
+    "gain, `tuned` with "
     "the best gain of a search on validation episodes; it learns nothing."
 )
 
@@ -199,25 +207,24 @@ def _kalman(task: Task, tuned: bool) -> dict[str, Any]:
 def _row(aim: Aim, results: list[dict[str, Any]]) -> Row:
     means = [float(np.mean(one["returns"])) / aim.scale for one in results]
     score = Interval.of(means)
-    solving = aim.target == 500.0
-    early = [
-        any(point["mean_return"] >= aim.target and point["step"] < SOLVED_BEFORE for point in one["curve"])
-        for one in results
-    ]
-    held = [mean >= aim.target for mean in means]
     row: Row = {
         "what": f"{aim.title}: {aim.agent}",
         "steps": f"{aim.steps:,}",
         "score": score.text(".4g" if aim.scale == 1.0 else ".3f"),
         "worst seed": f"{min(means):.4g}",
         "target": f"{aim.target:g}" + (f" ({aim.target_of})" if aim.target_of else ""),
-        "meets": sum(a and b for a, b in zip(early, held, strict=True)) >= 0.9 * len(held)
-        if solving
-        else bool(score.mean >= aim.target),
+        "meets": bool(score.mean >= aim.target),
         "seeds": str(len(means)),
         "values": {"score": score.to_dict(), "means": means},
     }
-    if solving:
+    if aim.solved_before is not None:
+        early = [
+            any(p["mean_return"] >= aim.target and p["step"] < aim.solved_before for p in one["curve"])
+            for one in results
+        ]
+        held = [mean >= aim.target for mean in means]
+        both = sum(a and b for a, b in zip(early, held, strict=True))
+        row["meets"] = both >= 0.9 * len(means)
         row["solved early"] = f"{sum(early)} of {len(early)}, at the end {sum(held)}"
     return row
 
