@@ -112,8 +112,7 @@ ABOUT = (
     "returns divided by 200, the largest. `target`: the least mean that was asked for, in the first row 500 "
     f"at the end of every seed; `solved early`: seeds that had 500 in an evaluation of {CURVE_EPISODES} episodes "
     f"before {AIMS['cart-pole'].solved_before:,} steps. Kalman filter: of the exact model, `LQR` with the expert's "
-    "gain, `tuned` with "
-    "the best gain of a search on validation episodes; it learns nothing."
+    "gain, `tuned` with the best gain of a search on validation episodes; it learns nothing."
 )
 
 
