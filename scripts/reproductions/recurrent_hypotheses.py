@@ -200,10 +200,10 @@ def figure(path: Path, found: Found) -> None:
                     results = list(found.get((task, method), {}).values())
                     if not results:
                         continue
-                    steps = [point["step"] for point in results[0]["curve"]]
+                    steps = [point["step"] / 1000 for point in results[0]["curve"]]
                     values = np.array([[p["mean_return"] for p in one["curve"]] for one in results])
                     ax.plot(steps, np.median(values, axis=0), color=colour, lw=1.4, label=method)
                     ax.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.10, lw=0)
-                plain(ax, f"{title}: {SETTINGS[task].title}", "environment steps", "return")
+                plain(ax, f"{title}: {SETTINGS[task].title}", "thousand environment steps", "return")
             line[0].legend(frameon=False, fontsize=6)
         save(drawing, path)

@@ -252,11 +252,11 @@ def figure(path: Path, curves: dict[str, list[list[dict[str, float]]]]) -> None:
             ax.set_axis_off()
         for ax, (slug, runs) in zip(axes.flat, curves.items(), strict=False):
             aim = AIMS[slug]
-            steps = [point["step"] for point in runs[0]]
+            steps = [point["step"] / 1000 for point in runs[0]]
             values = np.array([[point["mean_return"] for point in run] for run in runs]) / aim.scale
             ax.plot(steps, values.T, color="#0072B2", lw=0.6, alpha=0.35)
             ax.plot(steps, np.median(values, axis=0), color="#0072B2", lw=1.6)
             ax.axhline(aim.target, color="#888888", lw=0.8, ls="--")
             label = "return" if aim.scale == 1.0 else "return / 200"
-            plain(ax, f"{aim.title}: {aim.agent}", "environment steps", label)
+            plain(ax, f"{aim.title}: {aim.agent}", "thousand environment steps", label)
         save(drawing, path)
