@@ -12,6 +12,7 @@ returns between two methods, paired by seeds.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,8 @@ ABOUT = (
     "of the steps and held it at the end (`solved`); how far the hidden states learned from were off, relative to "
     "those of the present network (`state off`); linear decodability of the full observation from the hidden state; "
     "training time in minutes. Means over seeds with 95 % intervals. Rows `X over Y`: difference of test returns, "
-    "paired by seeds; `meets`: the interval lies above 0."
+    "paired by seeds; `meets`: the interval lies above 0. `All tasks`: means over tasks of returns where 0 is the "
+    "untrained agents' and 1 the best method's."
 )
 
 
@@ -92,7 +94,7 @@ def run(request: Request) -> Report:
             failed.append(f"Failed: {name}: {result['failed']}")
         else:
             found.setdefault((cell["name"], cell["method"]), {})[cell["seed"]] = result
-    rows = [row for task in SETTINGS for row in _rows(task, found)]
+    rows = [row for task in SETTINGS for row in _rows(task, found)] + _rows_of_all(found)
     path = request.folder / f"{NAME}.png"
     figure(path, found)
     configuration = {
@@ -125,25 +127,83 @@ def _slug(text: str) -> str:
     return "".join(c if c.isalnum() else "-" for c in text.lower()).replace("--", "-")
 
 
+def shares(found: Found) -> dict[str, dict[int, float]]:
+    """method -> seed -> mean over tasks of (R - R_0) / (R_1 - R_0).
+
+    R is the mean test return, R_0 that of all untrained agents on the task and R_1 the best method's, a mean over
+    seeds. Only seeds that a method was trained with on every task.
+    """
+    tasks = sorted({task for task, _ in found})
+    scaled: dict[tuple[str, str], dict[int, float]] = {}
+    for task in tasks:
+        here = {method: results for (name, method), results in found.items() if name == task}
+        means = {
+            method: {seed: float(np.mean(one["returns"])) for seed, one in results.items()}
+            for method, results in here.items()
+        }
+        untrained = [one["curve"][0]["mean_return"] for results in here.values() for one in results.values()]
+        low = float(np.mean(untrained))
+        high = max(float(np.mean(list(by_seed.values()))) for by_seed in means.values())
+        for method, by_seed in means.items():
+            scaled[task, method] = {
+                seed: (value - low) / max(high - low, 1e-9) for seed, value in by_seed.items()
+            }
+    methods = [method for method in METHODS if all((task, method) in scaled for task in tasks)]
+    return {
+        method: {
+            seed: float(np.mean([scaled[task, method][seed] for task in tasks]))
+            for seed in sorted(set.intersection(*(set(scaled[task, method]) for task in tasks)))
+        }
+        for method in methods
+    }
+
+
+def _rows_of_all(found: Found) -> list[Row]:
+    if not found:
+        return []
+    of = {method: by_seed for method, by_seed in shares(found).items() if by_seed}
+    rows: list[Row] = []
+    for method, by_seed in of.items():
+        score = Interval.of(list(by_seed.values()))
+        rows.append(
+            {
+                "what": f"All tasks: {method}",
+                "return": score.text(".3f"),
+                "meets": None,
+                "values": {"return": score.to_dict()},
+            }
+        )
+    return rows + [row for claim in CLAIMS if (row := _claim("All tasks", claim, of)) is not None]
+
+
+def _claim(title: str, claim: tuple[str, str, str], of: Mapping[str, Mapping[int, float]]) -> Row | None:
+    """The row of a difference; None without seeds that both methods have."""
+    hypothesis, better, worse = claim
+    ours, theirs = of.get(better, {}), of.get(worse, {})
+    both = sorted(set(ours) & set(theirs))
+    if not both:
+        return None
+    gap = Interval.of([ours[seed] - theirs[seed] for seed in both])
+    return {
+        "what": f"{title}, {hypothesis}: {better} over {worse}",
+        "difference": gap.text(".3g"),
+        "meets": bool(gap.low > 0.0) if gap.n > 1 else None,
+        "values": {"difference": gap.to_dict()},
+    }
+
+
 def _rows(task: str, found: Found) -> list[Row]:
     rows: list[Row] = []
     for method in METHODS:
         results = list(found.get((task, method), {}).values())
         if results:
             rows.append(_row(task, method, results))
-    for hypothesis, better, worse in CLAIMS:
-        ours, theirs = found.get((task, better), {}), found.get((task, worse), {})
-        both = sorted(set(ours) & set(theirs))
-        if both:
-            gap = Interval.of([np.mean(ours[s]["returns"]) - np.mean(theirs[s]["returns"]) for s in both])
-            rows.append(
-                {
-                    "what": f"{SETTINGS[task].title}, {hypothesis}: {better} over {worse}",
-                    "difference": gap.text(".3g"),
-                    "meets": bool(gap.low > 0.0) if gap.n > 1 else None,
-                    "values": {"difference": gap.to_dict()},
-                }
-            )
+    means = {
+        method: {seed: float(np.mean(one["returns"])) for seed, one in found.get((task, method), {}).items()}
+        for method in METHODS
+    }
+    claims = (_claim(SETTINGS[task].title, claim, means) for claim in CLAIMS)
+    rows += [row for row in claims if row is not None]
     return rows
 
 

@@ -152,3 +152,25 @@ def test_a_small_comparison(monkeypatch, tmp_path):
     assert "cart-pole, positions, H6: predictive state over SARSA" in rows
     assert "state off" in rows["cart-pole, positions: SARSA"]
     assert (tmp_path / "recurrent-hypotheses.png").stat().st_size > 10_000
+
+
+def test_shares_of_all_tasks_lie_between_untrained_and_best():
+    found = {
+        ("cart-pole", "SARSA"): {
+            0: _result([(0, 10.0), (9, 1.0)], 110.0),
+            1: _result([(0, 10.0)], 90.0),
+            2: _result([(0, 10.0)], 100.0),
+        },
+        ("cart-pole", "PQN"): {0: _result([(0, 10.0)], 55.0), 1: _result([(0, 10.0)], 35.0)},
+        ("pendulum", "SARSA"): {
+            0: _result([(0, -1200.0)], -700.0),
+            1: _result([(0, -1000.0)], -700.0),
+        },
+        ("pendulum", "PQN"): {0: _result([(0, -1100.0)], -300.0), 1: _result([(0, -1100.0)], -300.0)},
+    }
+    shares = hypotheses.shares(found)
+    assert shares["SARSA"] == pytest.approx({0: (100 / 90 + 0.5) / 2, 1: (80 / 90 + 0.5) / 2})
+    assert shares["PQN"] == pytest.approx({0: (45 / 90 + 1.0) / 2, 1: (25 / 90 + 1.0) / 2})
+    rows = {row["what"]: row for row in hypotheses._rows_of_all(found)}
+    gap = rows["All tasks, H5: SARSA over PQN"]["values"]["difference"]
+    assert gap["value"] == pytest.approx((55 / 90 - 0.5) / 2)
