@@ -158,7 +158,7 @@ _UNDER_NOISE = {"n_envs": 32, "gamma": 0.95, "weights": 0.95, "learning_rate": "
 RECURRENT_Q: dict[str, dict[str, Any]] = {
     "": {},
     "Pendulum": {**_FEWER, "gamma": 0.95, "weights": 0.95, "learning_rate": "linear:2e-3"},
-    "CartPoleBalanceNoisy": {**_UNDER_NOISE, **_FEWER},
+    "CartPoleBalanceNoisy": {**_UNDER_NOISE, **_FEWER, "n_envs": 64},
     "CartPoleBalanceNoisyEasy": {
         **_UNDER_NOISE,
         "gamma": 0.98,
@@ -167,11 +167,21 @@ RECURRENT_Q: dict[str, dict[str, Any]] = {
         "batch_rows": 32,
     },
 }
+# of the soft actor-critic with memory, chosen likewise
+RECURRENT_SAC: dict[str, dict[str, Any]] = {
+    "": {},
+    "Hopper": {"updates_per_step": 0.125, "learning_rate": "linear:1e-3"},
+}
 
 
 def recurrent_q(env_id: str) -> dict[str, Any]:
     """Constructor arguments of `RecurrentQSARSA` on an environment."""
     return {**action_bins(env_id), **_fitting(RECURRENT_Q, env_id)}
+
+
+def recurrent_sac(env_id: str) -> dict[str, Any]:
+    """Constructor arguments of `RecurrentSAC` on an environment."""
+    return dict(_fitting(RECURRENT_SAC, env_id))
 
 
 def action_bins(env_id: str) -> dict[str, Any]:

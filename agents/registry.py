@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefgym.agents.agent import HEADER, Agent, read_archive
-from beliefgym.agents.hyperparameters import action_bins, hyperparameters, recurrent_q
+from beliefgym.agents.hyperparameters import action_bins, hyperparameters, recurrent_q, recurrent_sac
 from beliefgym.wrappers.task import Task
 
 GROUP = "beliefgym.agents"
@@ -228,7 +228,10 @@ for _spec in (
         action_bins,
     ),
     AgentSpec(
-        "recurrent-sac", f"{_RECURRENT}:RecurrentSAC", "soft actor-critic with recurrent actor and critic"
+        "recurrent-sac",
+        f"{_RECURRENT}:RecurrentSAC",
+        "soft actor-critic with recurrent actor and critic",
+        recurrent_sac,
     ),
     AgentSpec("recurrent-ppo", _SB3, "sb3-contrib's RecurrentPPO (LSTM)", _sb3("RecurrentPPO")),
     *(

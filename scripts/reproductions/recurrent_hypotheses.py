@@ -61,7 +61,7 @@ COLUMNS = (
 ABOUT = (
     f"Returns of {TEST_EPISODES} test episodes after training (`return`), the best of 20 evaluations of "
     f"{CURVE_EPISODES} validation episodes on the way (`best`) and what of it, from the random policy's return on, "
-    "is left at the end (`kept`); of tasks with a solution, the seeds whose evaluation reached it before a quarter "
+    "is left at the end (`kept`); of tasks with a solution, the seeds whose evaluation reached it before half "
     "of the steps and held it at the end (`solved`); how far the hidden states learned from were off, relative to "
     "those of the present network (`state off`); linear decodability of the full observation from the hidden state; "
     "training time in minutes. Means over seeds with 95 % intervals. Rows `X over Y`: difference of test returns, "
@@ -231,12 +231,12 @@ def _row(task: str, method: str, results: list[dict[str, Any]]) -> Row:
         "values": {"return": final.to_dict(), "best": best.to_dict(), "kept": kept.to_dict()},
     }
     if setting.best is not None:
-        quarter = [
-            any(p["mean_return"] >= setting.best and p["step"] <= setting.steps / 4 for p in one["curve"])
+        early = [
+            any(p["mean_return"] >= setting.best and p["step"] <= setting.steps / 2 for p in one["curve"])
             and float(np.mean(one["returns"])) >= setting.best
             for one in results
         ]
-        row["solved"] = f"{sum(quarter)} of {len(quarter)}"
+        row["solved"] = f"{sum(early)} of {len(early)}"
     if off:
         row["state off"] = f"{float(np.mean(off)):.3f}"
     if told:

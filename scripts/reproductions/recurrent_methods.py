@@ -45,9 +45,9 @@ def _cart_pole(suffix: str) -> Task:
 
 
 SETTINGS: dict[str, Setting] = {
-    "cart-pole": Setting("cart-pole, positions", _cart_pole("Position"), 100_000, 500.0),
+    "cart-pole": Setting("cart-pole, positions", _cart_pole("Position"), 60_000, 500.0),
     "cart-pole-noisy": Setting(
-        "cart-pole, noise 0.2", _cart_pole("NoisyMedium"), 100_000, options={"gamma": 0.95}
+        "cart-pole, noise 0.2", _cart_pole("NoisyMedium"), 80_000, options={"gamma": 0.95}
     ),
     "pendulum": Setting(
         "pendulum, position",
@@ -59,7 +59,7 @@ SETTINGS: dict[str, Setting] = {
     "acrobot": Setting(
         "acrobot, positions",
         Task("Acrobot-v1", {}, (("PartialObservation", {"keep": [0, 1, 2, 3]}),)),
-        60_000,
+        40_000,
         -100.0,
     ),
     "swing-up": Setting(
@@ -71,8 +71,17 @@ SETTINGS: dict[str, Setting] = {
     ),
     "t-maze": Setting("T-maze", Task("beliefgym/TMazeMemory-v0"), 40_000, 4.0),
 }
-_PREDICTIVE = {"predictive_state": {"weight": 1.0, "k": 5}}
+# What every SARSA here is trained with, and every rival of a kind: one setting for all tasks
+SARSA: dict[str, Any] = {
+    "n_envs": 16,
+    "reuse": 16,
+    "batch_rows": None,
+    "weights": 0.95,
+    "learning_rate": "linear:2e-3",
+    "auxiliary": {},
+}
 LETTER: dict[str, Any] = {  # the thesis proposal's algorithm: one rollout, both sides, arg max
+    **SARSA,
     "reuse": 1,
     "average": 0.0,
     "temperature": 0.0,
@@ -80,45 +89,41 @@ LETTER: dict[str, Any] = {  # the thesis proposal's algorithm: one rollout, both
     "gradient": "residual",
     "n_steps": 4,
 }
-SEMI = {**LETTER, "gradient": "semi"}
+
+
+def _sarsa(**options: Any) -> tuple[str, dict[str, Any]]:
+    return "recurrent-q", {**SARSA, **options}
+
+
+def _besides(objective: str, weight: float | str = 1.0, **options: Any) -> tuple[str, dict[str, Any]]:
+    return _sarsa(auxiliary={objective: {"weight": weight, **options}})
+
 
 # name -> (agent, options)
 H5: dict[str, tuple[str, dict[str, Any]]] = {
-    "SARSA": ("recurrent-q", {"auxiliary": {}}),
-    "SARSA, policies not held near": (
-        "recurrent-q",
-        {"auxiliary": {}, "munchausen": 0.0, "temperature": 0.1},
-    ),
-    "SARSA, to the letter": ("recurrent-q", {"auxiliary": {}, **LETTER}),
-    "SARSA, one rollout, semi-gradient": ("recurrent-q", {"auxiliary": {}, **SEMI}),
-    "SARSA, states carried on": ("recurrent-q", {"auxiliary": {}, "refresh": "none"}),
-    "DRQN, random": ("drqn", {}),
-    "DRQN, sequential": ("drqn", {"updates": "sequential"}),
+    "SARSA": _sarsa(),
+    "SARSA, policies not held near": _sarsa(munchausen=0.0, temperature=0.1),
+    "SARSA, to the letter": ("recurrent-q", LETTER),
+    "SARSA, one rollout, semi-gradient": ("recurrent-q", {**LETTER, "gradient": "semi"}),
+    "SARSA, states carried on": _sarsa(refresh="none"),
+    "DRQN, random": ("drqn", {"double": True}),
+    "DRQN, sequential": ("drqn", {"updates": "sequential", "learning_rate": "linear:2e-3"}),
     "R2D2": ("r2d2", {}),
     "PQN": ("recurrent-pqn", {}),
-    "SARSA, stack of 4": ("recurrent-q", {"auxiliary": {}, "cell": "stack4"}),
+    "SARSA, stack of 4": _sarsa(cell="stack4"),
     "DQN, stack of 4": ("drqn", {"cell": "stack4", "burn_in": 3}),
 }
 H6: dict[str, tuple[str, dict[str, Any]]] = {
-    "predictive state": ("recurrent-q", {"auxiliary": _PREDICTIVE}),
-    "predictive state, falling": (
-        "recurrent-q",
-        {"auxiliary": {"predictive_state": {"weight": "linear:1.0", "k": 5}}},
-    ),
-    "predictive state, h itself": (
-        "recurrent-q",
-        {"auxiliary": {"predictive_state": {"weight": 1.0, "k": 5, "on_hidden": True}}},
-    ),
-    "dynamics": ("recurrent-q", {"auxiliary": {"dynamics": {"weight": 1.0}}}),
-    "latent self-prediction": ("recurrent-q", {"auxiliary": {"latent_self_prediction": {"weight": 1.0}}}),
+    "predictive state": _besides("predictive_state", k=5),
+    "predictive state, falling": _besides("predictive_state", "linear:1.0", k=5),
+    "predictive state, h itself": _besides("predictive_state", k=5, on_hidden=True),
+    "dynamics": _besides("dynamics"),
+    "latent self-prediction": _besides("latent_self_prediction"),
 }
 H7: dict[str, tuple[str, dict[str, Any]]] = {
-    "predictive rewards": ("recurrent-q", {"auxiliary": {"predictive_rewards": {"weight": 1.0, "k": 5}}}),
-    "predictive rewards, h itself": (
-        "recurrent-q",
-        {"auxiliary": {"predictive_rewards": {"weight": 1.0, "k": 5, "on_hidden": True}}},
-    ),
-    "predictive values": ("recurrent-q", {"auxiliary": {"predictive_values": {"weight": 1.0, "k": 5}}}),
+    "predictive rewards": _besides("predictive_rewards", k=5),
+    "predictive rewards, h itself": _besides("predictive_rewards", k=5, on_hidden=True),
+    "predictive values": _besides("predictive_values", k=5),
 }
 METHODS = {**H5, **H6, **H7}
 
