@@ -109,7 +109,7 @@ H5: dict[str, tuple[str, dict[str, Any]]] = {
     "DRQN, random": ("drqn", {"double": True}),
     "DRQN, sequential": ("drqn", {"updates": "sequential", "learning_rate": "linear:2e-3"}),
     "R2D2": ("r2d2", {}),
-    "PQN": ("recurrent-pqn", {}),
+    "PQN": ("recurrent-pqn", {"n_envs": 8, "epochs": 8}),
     "SARSA, stack of 4": _sarsa(cell="stack4"),
     "DQN, stack of 4": ("drqn", {"cell": "stack4", "burn_in": 3}),
 }
