@@ -31,6 +31,8 @@ from beliefgym.scripts.reproductions.recurrent_methods import (
     METHODS,
     SETTINGS,
     TEST_EPISODES,
+    VARIANT_SEEDS,
+    VARIANTS,
 )
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
@@ -78,6 +80,7 @@ def run(request: Request) -> Report:
         for seed in seeds
         for task in SETTINGS
         for method in METHODS
+        if method not in VARIANTS or seed < request.seed + VARIANT_SEEDS
     }
     done = run_cells(
         "beliefgym.scripts.reproductions.recurrent_methods:cell",

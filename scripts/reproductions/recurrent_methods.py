@@ -47,7 +47,7 @@ def _cart_pole(suffix: str) -> Task:
 SETTINGS: dict[str, Setting] = {
     "cart-pole": Setting("cart-pole, positions", _cart_pole("Position"), 60_000, 500.0),
     "cart-pole-noisy": Setting(
-        "cart-pole, noise 0.2", _cart_pole("NoisyMedium"), 80_000, options={"gamma": 0.95}
+        "cart-pole, noise 0.2", _cart_pole("NoisyMedium"), 50_000, options={"gamma": 0.95}
     ),
     "pendulum": Setting(
         "pendulum, position",
@@ -59,13 +59,13 @@ SETTINGS: dict[str, Setting] = {
     "acrobot": Setting(
         "acrobot, positions",
         Task("Acrobot-v1", {}, (("PartialObservation", {"keep": [0, 1, 2, 3]}),)),
-        40_000,
+        30_000,
         -100.0,
     ),
     "swing-up": Setting(
         "cart-pole swing-up, positions",
         Task("beliefgym/CartPoleSwingUpPosition-v0"),
-        60_000,
+        50_000,
         None,
         {"bins": 5},
     ),
@@ -111,7 +111,7 @@ H5: dict[str, tuple[str, dict[str, Any]]] = {
     "R2D2": ("r2d2", {}),
     "PQN": ("recurrent-pqn", {"n_envs": 8, "epochs": 8}),
     "SARSA, stack of 4": _sarsa(cell="stack4"),
-    "DQN, stack of 4": ("drqn", {"cell": "stack4", "burn_in": 3}),
+    "DQN, stack of 4": ("drqn", {"cell": "stack4", "burn_in": 3, "learning_rate": "linear:2e-3"}),
 }
 H6: dict[str, tuple[str, dict[str, Any]]] = {
     "predictive state": _besides("predictive_state", k=5),
@@ -126,6 +126,13 @@ H7: dict[str, tuple[str, dict[str, Any]]] = {
     "predictive values": _besides("predictive_values", k=5),
 }
 METHODS = {**H5, **H6, **H7}
+# with at most so many seeds: what a part of a method is good for
+VARIANT_SEEDS = 5
+VARIANTS = (
+    *("SARSA, policies not held near", "SARSA, one rollout, semi-gradient", "SARSA, states carried on"),
+    *("predictive state, falling", "predictive state, h itself", "predictive rewards, h itself"),
+    *("dynamics", "latent self-prediction"),
+)
 
 
 def cell(cell: dict[str, Any], _: Any) -> dict[str, Any]:
