@@ -121,9 +121,9 @@ H6: dict[str, tuple[str, dict[str, Any]]] = {
     "latent self-prediction": _besides("latent_self_prediction"),
 }
 H7: dict[str, tuple[str, dict[str, Any]]] = {
-    "predictive rewards": _besides("predictive_rewards", k=5),
-    "predictive rewards, h itself": _besides("predictive_rewards", k=5, on_hidden=True),
-    "predictive values": _besides("predictive_values", k=5),
+    "predictive rewards": _besides("predictive_rewards", 0.1, k=5),
+    "predictive rewards, h itself": _besides("predictive_rewards", 0.1, k=5, on_hidden=True),
+    "predictive values": _besides("predictive_values", 0.1, k=5),
 }
 METHODS = {**H5, **H6, **H7}
 # with at most so many seeds: what a part of a method is good for
