@@ -32,6 +32,7 @@ from beliefgym.scripts.reproductions.recurrent_methods import (
     SETTINGS,
     TEST_EPISODES,
     VARIANT_SEEDS,
+    VARIANT_TASKS,
     VARIANTS,
 )
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
@@ -80,7 +81,7 @@ def run(request: Request) -> Report:
         for seed in seeds
         for task in SETTINGS
         for method in METHODS
-        if method not in VARIANTS or seed < request.seed + VARIANT_SEEDS
+        if method not in VARIANTS or (task in VARIANT_TASKS and seed < request.seed + VARIANT_SEEDS)
     }
     done = run_cells(
         "beliefgym.scripts.reproductions.recurrent_methods:cell",
@@ -88,6 +89,7 @@ def run(request: Request) -> Report:
         request.folder / "cells" / NAME,
         request.jobs,
         request.told,
+        fresh=False,
     )
     found: Found = {}
     failed = []

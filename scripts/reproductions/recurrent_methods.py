@@ -129,8 +129,8 @@ H7: dict[str, tuple[str, dict[str, Any]]] = {
     "predictive values": _besides("predictive_values", 0.1, k=5),
 }
 METHODS = {**H5, **H6, **H7}
-# with at most so many seeds: what a part of a method is good for
-VARIANT_SEEDS = 5
+# what a part of a method is good for: on some tasks, with at most so many seeds
+VARIANT_SEEDS, VARIANT_TASKS = 5, ("cart-pole", "pendulum", "t-maze")
 VARIANTS = (
     *("SARSA, policies not held near", "SARSA, one rollout, semi-gradient", "SARSA, states carried on"),
     *("predictive state, falling", "predictive state, h itself", "predictive rewards, h itself"),
