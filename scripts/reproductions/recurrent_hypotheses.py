@@ -31,9 +31,7 @@ from beliefgym.scripts.reproductions.recurrent_methods import (
     METHODS,
     SETTINGS,
     TEST_EPISODES,
-    VARIANT_SEEDS,
-    VARIANT_TASKS,
-    VARIANTS,
+    compared,
 )
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
@@ -81,7 +79,7 @@ def run(request: Request) -> Report:
         for seed in seeds
         for task in SETTINGS
         for method in METHODS
-        if method not in VARIANTS or (task in VARIANT_TASKS and seed < request.seed + VARIANT_SEEDS)
+        if compared(task, method, seed - request.seed)
     }
     done = run_cells(
         "beliefgym.scripts.reproductions.recurrent_methods:cell",
