@@ -31,6 +31,7 @@ from beliefgym.scripts.reproductions.recurrent_methods import (
     METHODS,
     SETTINGS,
     TEST_EPISODES,
+    VARIANTS,
     compared,
 )
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
@@ -106,7 +107,7 @@ def run(request: Request) -> Report:
         "steps": {name: setting.steps for name, setting in SETTINGS.items()},
         "methods": METHODS,
     }
-    caption = "Returns on validation episodes over environment steps: medians over seeds, and the range of all seeds."
+    caption = "Returns on validation episodes over environment steps: medians over seeds, and the half around it."
     return Report(ABOUT, COLUMNS, rows, configuration, {path.name: caption}, failed)
 
 
@@ -248,25 +249,35 @@ def _row(task: str, method: str, results: list[dict[str, Any]]) -> Row:
 
 
 def figure(path: Path, found: Found) -> None:
-    """A row of panels for each hypothesis: learning curves on every task."""
+    """A row of panels for each group of methods: learning curves on every task."""
     shown = [task for task in SETTINGS if any(key[0] == task for key in found)]
     if not shown:
         return
-    groups = {"H5": list(H5), "H6 and H7": [PLAIN, *H6, *H7]}
+    parts = [name for name in H5 if name in VARIANTS]
+    groups = {
+        "H5": [name for name in H5 if name not in parts],
+        "parts": [PLAIN, *parts],
+        "H6, H7": [PLAIN, *H6, *H7],
+    }
+    groups = {title: names for title, names in groups.items() if any(key[1] in names[1:] for key in found)}
     colours = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]
     with matplotlib.rc_context(STYLE):
-        drawing = Figure(figsize=(3.4 * len(shown), 6.6), layout="constrained")
-        axes = drawing.subplots(2, len(shown), squeeze=False)
+        drawing = Figure(figsize=(3.2 * len(shown) + 2.0, 2.9 * len(groups)), layout="constrained")
+        axes = drawing.subplots(len(groups), len(shown), squeeze=False)
         for line, (title, methods) in zip(axes, groups.items(), strict=True):
+            drawn = {}
             for ax, task in zip(line, shown, strict=True):
-                for colour, method in zip(colours, methods, strict=False):
+                for colour, method in zip(colours[: len(methods)], methods, strict=True):
                     results = list(found.get((task, method), {}).values())
                     if not results:
                         continue
                     steps = [point["step"] / 1000 for point in results[0]["curve"]]
                     values = np.array([[p["mean_return"] for p in one["curve"]] for one in results])
-                    ax.plot(steps, np.median(values, axis=0), color=colour, lw=1.4, label=method)
-                    ax.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.10, lw=0)
+                    (drawn[method],) = ax.plot(steps, np.median(values, axis=0), color=colour, lw=1.4)
+                    low, high = np.quantile(values, (0.25, 0.75), axis=0)
+                    ax.fill_between(steps, low, high, color=colour, alpha=0.12, lw=0)
                 plain(ax, f"{title}: {SETTINGS[task].title}", "thousand environment steps", "return")
-            line[0].legend(frameon=False, fontsize=6)
+            line[-1].legend(
+                drawn.values(), drawn.keys(), frameon=False, loc="center left", bbox_to_anchor=(1.02, 0.5)
+            )
         save(drawing, path)
