@@ -107,7 +107,9 @@ def run(request: Request) -> Report:
         "steps": {name: setting.steps for name, setting in SETTINGS.items()},
         "methods": METHODS,
     }
-    caption = "Returns on validation episodes over environment steps: medians over seeds, and the half around it."
+    caption = (
+        "Returns on validation episodes over environment steps: medians over seeds, and the half around it."
+    )
     return Report(ABOUT, COLUMNS, rows, configuration, {path.name: caption}, failed)
 
 

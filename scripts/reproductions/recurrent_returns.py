@@ -31,6 +31,7 @@ VERSION = 1  # of the protocol
 TEST_SEED, TEST_EPISODES = 1_000_000, 300
 TUNING_SEED, TUNING_EPISODES = 4_000_000, 100
 CURVE_POINTS, CURVE_EPISODES = 40, 20
+FIGURE_COLUMNS = 4
 FULL_FORCE = 100.0  # a gain so large that every mean but the smallest asks for full force
 SEARCH = {"popsize": 8, "maxiter": 8}  # of the best gain
 
@@ -256,8 +257,9 @@ def figure(path: Path, curves: dict[str, list[list[dict[str, float]]]]) -> None:
     if not curves:
         return
     with matplotlib.rc_context(STYLE):
-        drawing = Figure(figsize=(9.6, 2.6 * -(-len(curves) // 3)), layout="constrained")
-        axes = drawing.subplots(-(-len(curves) // 3), 3, squeeze=False)
+        n_rows = -(-len(curves) // FIGURE_COLUMNS)
+        drawing = Figure(figsize=(3.4 * FIGURE_COLUMNS, 2.6 * n_rows), layout="constrained")
+        axes = drawing.subplots(n_rows, FIGURE_COLUMNS, squeeze=False)
         for ax in axes.flat[len(curves) :]:
             ax.set_axis_off()
         for ax, (slug, runs) in zip(axes.flat, curves.items(), strict=False):
