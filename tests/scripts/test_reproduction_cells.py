@@ -29,6 +29,13 @@ def test_each_cell_has_its_file_and_is_not_run_again(tmp_path, jobs):
     assert (tmp_path / "x-2.json").stat().st_mtime_ns == written["x-2.json"]
 
 
+@pytest.mark.parametrize(("fresh", "fewest", "most"), [(True, 3, 3), (False, 1, 2)])
+def test_processes_are_new_or_go_on(tmp_path, fresh, fewest, most):
+    found = run_cells(SQUARED, CELLS, tmp_path, 2, lambda text: None, fresh=fresh)
+    assert [result["square"] for result in found.values()] == [4, 9, 25]
+    assert fewest <= len({result["process"] for result in found.values()}) <= most
+
+
 def test_a_changed_cell_is_told_and_runs_again(tmp_path):
     run_cells(SQUARED, CELLS, tmp_path, 1, lambda text: None)
     told = []
