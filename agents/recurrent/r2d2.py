@@ -15,10 +15,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 
 from beliefgym.agents.recurrent.q_agent import RecurrentQAgent
 from beliefgym.agents.recurrent.replay import EpisodeReplay
+from beliefgym.agents.recurrent.replay_drift import EVERY, replay_drift
 from beliefgym.agents.recurrent.sarsa_loss import RecurrentSarsaLoss
 from beliefgym.agents.recurrent.target_network import target_updater
 from beliefgym.wrappers.task import Task
@@ -89,6 +91,7 @@ class R2D2(RecurrentQAgent):
         self._replay = EpisodeReplay(capacity)
         super().__init__(task, seed, learning_rate=learning_rate, **shared)
         self._target = target_updater(self.loss, target_update)
+        self._draws_of_drift = torch.Generator().manual_seed(seed)  # which leave the training's alone
 
     def make_loss(self) -> RecurrentSarsaLoss:
         """See `RecurrentQAgent.make_loss`."""
@@ -108,11 +111,21 @@ class R2D2(RecurrentQAgent):
         self._replay.extend(rollout)
         if len(self._replay) < self._own["learning_starts"]:
             return {}
+        told = {}
+        if len(self.history) % EVERY == 0:
+            own = {"length": self._own["sequence_length"], "burn_in": self._own["burn_in"]}
+            told["kept_state_drift"] = replay_drift(
+                self.network.encoder,
+                self._replay,
+                self._draws_of_drift,
+                **own,
+                stored=not self._own["zero_state"],
+            )
         for _ in range(self._own["n_batches"]):
             answer = self.step_optimizer(self.sample())
             self._target.step()
         self.sync_acting()
-        return {key: float(value.detach()) for key, value in answer.items()}
+        return told | {key: float(value.detach()) for key, value in answer.items()}
 
     def sample(self) -> TensorDict:
         """Sequences with the state that was stored at their first step, or zeros."""
