@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
@@ -125,6 +125,12 @@ class SB3Agent(Agent):
             raise ValueError(
                 f"{algorithm} acts in a Box of continuous actions, but {self.task.label} has {self.action_space}; "
                 "take PPO, A2C, RecurrentPPO or DQN"
+            )
+        if algorithm == "DQN" and not isinstance(self.action_space, Discrete):
+            raise ValueError(
+                f"DQN chooses among finitely many actions, but {self.task.label} has {self.action_space}; put "
+                f'DiscreteActions around it (Task("{self.task.env_id}", wrappers=(("DiscreteActions", {{"bins": 5}}),))), '
+                "or take SAC"
             )
         if n_stack > 1:
             require_box(self.observation_space, "a stack of frames")

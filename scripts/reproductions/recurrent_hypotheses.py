@@ -33,6 +33,7 @@ from beliefgym.scripts.reproductions.recurrent_methods import (
     TEST_EPISODES,
     VARIANTS,
     compared,
+    placed,
 )
 from beliefgym.scripts.reproductions.report import Interval, Report, Request, Row
 
@@ -117,15 +118,15 @@ def run(request: Request) -> Report:
 def _cell(task: str, method: str, seed: int) -> dict[str, Any]:
     setting = SETTINGS[task]
     agent, options = METHODS[method]
-    given = {**setting.options, **options}  # over what is registered
+    where, given = placed(setting, agent, options)
     return {
         "version": VERSION,
         "name": task,
         "method": method,
-        "task": setting.task.to_dict(),
+        "task": where.to_dict(),
         "steps": setting.steps,
         "agent": agent,
-        "options": make_agent(agent, setting.task, seed=seed, **given).options(),  # defaults too
+        "options": make_agent(agent, where, seed=seed, **given).options(),  # and what is registered
         "seed": seed,
     }
 

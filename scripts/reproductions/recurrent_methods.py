@@ -15,6 +15,7 @@ Steps on acrobot and swing-up were raised, from 30,000 and 50,000, after seed 0 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -146,6 +147,16 @@ VARIANTS = (
     *("predictive state, falling", "predictive state, h itself", "predictive rewards, h itself"),
     *("dynamics", "latent self-prediction"),
 )
+
+
+def placed(setting: Setting, agent: str, options: Mapping[str, Any]) -> tuple[Task, dict[str, Any]]:
+    """The task that an agent gets, and its options there: SB3's take a grid as a wrapper, a discount as an argument."""
+    if agent not in SB3:
+        return setting.task, {**setting.options, **options}
+    task, here = setting.task, dict(setting.options)
+    if (bins := here.pop("bins", None)) is not None:
+        task = Task(task.env_id, task.kwargs, (*task.wrappers, ("DiscreteActions", {"bins": bins})))
+    return task, {**options, "arguments": {**here, **options["arguments"]}}
 
 
 def compared(task: str, method: str, seed: int) -> bool:

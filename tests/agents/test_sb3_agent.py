@@ -185,6 +185,8 @@ def test_files_that_are_no_agents_are_told(tmp_path):
 def test_impossible_options_are_told():
     with pytest.raises(ValueError, match="algorithm to be one of PPO, .* got 'PP0'"):
         SB3Agent(TASK, algorithm="PP0")
+    with pytest.raises(ValueError, match="DQN chooses among finitely many .*put DiscreteActions around it"):
+        SB3Agent(TASK, algorithm="DQN", arguments=OFF_POLICY)
     discrete = Task(TASK.env_id, {}, (("DiscreteActions", {"bins": 3}),))
     with pytest.raises(ValueError, match="rescale_actions needs a flat Box space"):
         SB3Agent(discrete, algorithm="PPO", rescale_actions=True, arguments=SMALL)
