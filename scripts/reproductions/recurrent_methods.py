@@ -107,6 +107,7 @@ def _besides(objective: str, weight: float | str = 1.0, **options: Any) -> tuple
     return _sarsa(auxiliary={objective: {"weight": weight, **options}})
 
 
+SB3 = ("recurrent-ppo", "dqn-stack")
 # name -> (agent, options)
 H5: dict[str, tuple[str, dict[str, Any]]] = {
     "SARSA": _sarsa(),
