@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-_RECURRENT = {
+RECURRENT_POLICY: dict[str, Any] = {
     "policy": "MlpLstmPolicy",
     "policy_kwargs": {
         "net_arch": [64],
@@ -56,7 +56,7 @@ _PPO_CONTROL: dict[str, Any] = {
     },
 }
 # recurrent PPO has the same setting there
-_RECURRENT_CONTROL = {**_PPO_CONTROL, "arguments": {**_PPO_CONTROL["arguments"], **_RECURRENT}}
+_RECURRENT_CONTROL = {**_PPO_CONTROL, "arguments": {**_PPO_CONTROL["arguments"], **RECURRENT_POLICY}}
 _CONTROL = (
     *("Helicopter", "Quadrotor", "MobileBase", "Baxter", "Mico", "DoublePendulum"),
     *("Hopper", "Walker2d", "HalfCheetah", "Swimmer", "InvertedPendulum"),
@@ -116,13 +116,29 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
             },
         },
     },
+    "DQN": {
+        "": {
+            "n_envs": 1,
+            "arguments": {
+                "policy": "MlpPolicy",
+                "learning_rate": "linear:1e-3",
+                "buffer_size": 100_000,
+                "learning_starts": 1000,
+                "batch_size": 64,
+                "train_freq": 1,
+                "gradient_steps": 1,
+                "target_update_interval": 250,
+                "policy_kwargs": {"net_arch": [64, 64]},
+            },
+        },
+    },
     "RecurrentPPO": {
-        "": {"n_envs": 8, "normalize": True, "arguments": {**_RECURRENT, "n_steps": 256}},
+        "": {"n_envs": 8, "normalize": True, "arguments": {**RECURRENT_POLICY, "n_steps": 256}},
         "Pendulum": {
             "n_envs": 4,
             "normalize": True,
             "arguments": {
-                **_RECURRENT,
+                **RECURRENT_POLICY,
                 **_PPO_PENDULUM,
             },
         },
@@ -132,7 +148,7 @@ HYPERPARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
             "normalize": True,
             "rescale_actions": True,
             "arguments": {
-                **_RECURRENT,
+                **RECURRENT_POLICY,
                 "n_steps": 256,
                 "gae_lambda": 0.95,
                 "gamma": 0.99,

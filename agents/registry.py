@@ -194,6 +194,7 @@ for _spec in (
     AgentSpec("ppo-stack", _SB3, "SB3's PPO on the last 4 observations", _sb3("PPO", n_stack=4)),
     AgentSpec("sac", _SB3, "SB3's SAC on the last observation alone", _sb3("SAC")),
     AgentSpec("sac-stack", _SB3, "SB3's SAC on the last 4 observations", _sac_stack),
+    AgentSpec("dqn-stack", _SB3, "SB3's DQN on the last 4 observations", _sb3("DQN", n_stack=4)),
     AgentSpec(
         "dad-control",
         "beliefgym.agents.dad_control:DaDControl",

@@ -129,8 +129,8 @@ class SB3Agent(Agent):
         if algorithm == "DQN" and not isinstance(self.action_space, Discrete):
             raise ValueError(
                 f"DQN chooses among finitely many actions, but {self.task.label} has {self.action_space}; put "
-                f'DiscreteActions around it (Task("{self.task.env_id}", wrappers=(("DiscreteActions", {{"bins": 5}}),))), '
-                "or take SAC"
+                "DiscreteActions around it "
+                f'(Task("{self.task.env_id}", wrappers=(("DiscreteActions", {{"bins": 5}}),))), or take SAC'
             )
         if n_stack > 1:
             require_box(self.observation_space, "a stack of frames")

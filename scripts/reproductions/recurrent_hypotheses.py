@@ -41,11 +41,15 @@ Found = dict[tuple[str, str], dict[int, dict[str, Any]]]  # (task, method) -> se
 NAME = "recurrent-hypotheses"
 VERSION = 1  # of the protocol
 PLAIN = "SARSA"
-RIVALS = ("DRQN, random", "DRQN, sequential", "R2D2", "PQN", "SARSA, stack of 4", "DQN, stack of 4")
+RIVALS = (
+    *("DRQN, random", "DRQN, sequential", "R2D2", "PQN", "RecurrentPPO"),
+    *("SARSA, stack of 4", "DQN, stack of 4", "DQN of SB3, stack of 4"),
+)
 CLAIMS: tuple[tuple[str, str, str], ...] = (
     *(("H5", PLAIN, rival) for rival in RIVALS),
     *(("H5", PLAIN, other) for other in H5 if other.startswith("SARSA, ") and other not in RIVALS),
     *(("H6", name, PLAIN) for name in H6),
+    ("H6", "predictive state", "DRQN, random"),
     *(("H7", name, PLAIN) for name in H7),
     *(("H7", name, "predictive state") for name in H7),
 )

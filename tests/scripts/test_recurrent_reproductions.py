@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Discrete
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
 
 from beliefgym.agents import make_agent
 from beliefgym.scripts.reproductions import recurrent_hypotheses as hypotheses
+from beliefgym.scripts.reproductions import recurrent_methods as methods
 from beliefgym.scripts.reproductions import recurrent_returns as returns
 from beliefgym.scripts.reproductions.recurrent_decoding import RIDGE, decodability, hidden_state, linear_r2
 from beliefgym.scripts.reproductions.report import Request
@@ -126,8 +128,6 @@ def test_under_noise_the_score_is_a_share_of_200_steps():
 
 
 def test_a_small_comparison(monkeypatch, tmp_path):
-    from beliefgym.scripts.reproductions import recurrent_methods as methods
-
     for name, value in {
         "TEST_EPISODES": 4,
         "CURVE_POINTS": 2,
@@ -138,7 +138,7 @@ def test_a_small_comparison(monkeypatch, tmp_path):
     monkeypatch.setattr(
         hypotheses, "SETTINGS", {"cart-pole": replace(methods.SETTINGS["cart-pole"], steps=1024)}
     )
-    names = ("SARSA", "DRQN, random", "SARSA, stack of 4", "predictive state")
+    names = ("SARSA", "DRQN, random", "RecurrentPPO", "DQN of SB3, stack of 4", "predictive state")
     monkeypatch.setattr(hypotheses, "METHODS", {name: methods.METHODS[name] for name in names})
     report = hypotheses.run(Request(seed=3, seeds=2, jobs=1, folder=tmp_path, told=lambda _: None))
     assert not report.notes
@@ -174,3 +174,24 @@ def test_shares_of_all_tasks_lie_between_untrained_and_best():
     rows = {row["what"]: row for row in hypotheses._rows_of_all(found)}
     gap = rows["All tasks, H5: SARSA over PQN"]["values"]["difference"]
     assert gap["value"] == pytest.approx((55 / 90 - 0.5) / 2)
+
+
+def test_seeds_of_a_method():
+    def count(task, method):
+        return sum(methods.compared(task, method, seed) for seed in range(20))
+
+    assert count("acrobot", "SARSA") == 20
+    assert count("acrobot", "DRQN, random") == 10
+    assert count("acrobot", "PQN") == count("cart-pole", "dynamics") == 5
+    assert count("acrobot", "dynamics") == 0
+
+
+def test_a_grid_and_a_discount_reach_every_agent():
+    setting = methods.SETTINGS["pendulum"]
+    assert methods.placed(setting, "drqn", {"double": True}) == (
+        setting.task,
+        {"bins": 9, "gamma": 0.95, "double": True},
+    )
+    task, options = methods.placed(setting, "recurrent-ppo", {"n_envs": 2, "arguments": {"n_steps": 8}})
+    assert task.make().action_space == Discrete(9)
+    assert options == {"n_envs": 2, "arguments": {"gamma": 0.95, "n_steps": 8}}
