@@ -69,7 +69,7 @@ def test_the_model_based_agents_act_where_the_cost_can_be_read_off_what_is_shown
         make_agent(name, "beliefgym/HopperPosition-v0")
 
 
-@pytest.mark.parametrize("name", [name for name in agent_specs() if name not in MODEL_BASED])
+@pytest.mark.parametrize("name", [name for name in agent_specs() if name not in (*MODEL_BASED, "dqn-stack")])
 @pytest.mark.parametrize(
     "env_id",
     [
@@ -106,6 +106,11 @@ def test_an_action_space_that_an_algorithm_cannot_act_in_is_told():
         ValueError, match=r"SAC acts in a Box .* CartPoleBalance-v0 has Discrete\(2\); take PPO"
     ):
         make_agent("sac", "beliefgym/CartPoleBalance-v0")
+    _act_once("dqn-stack", "beliefgym/CartPoleBalancePosition-v0")
+    with pytest.raises(
+        ValueError, match=r"DQN chooses among finitely many .*PendulumPosition-v0 has Box.*bins"
+    ):
+        make_agent("dqn-stack", "beliefgym/PendulumPosition-v0")
 
 
 def test_evaluation_sums_whole_episodes_of_their_own_seeds():
