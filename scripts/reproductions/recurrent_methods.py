@@ -1,13 +1,16 @@
 """What `beliefgym reproduce recurrent-hypotheses` compares: tasks, methods, and one cell of their product.
 
-Every method has the same network (an LSTM of 64 between layers of 64, or four frames and no recurrence), discount,
-actions and number of environment steps, and one setting for all tasks: the best of a few on the validation episodes of
-cart-pole positions (50,000 steps) and pendulum position (60,000), training seeds 100 and 101. SARSA was tried with
-learning rates, lambda, reuse and copies (7 settings); DRQN and DQN with learning rates, target updates and double
-Q-learning (5 each); PQN with learning rates, lambda, epochs, copies and a soft-max (8); R2D2 with gradient steps, a
-learning rate and shorter sequences (4, on seed 100 and the cart-pole); auxiliary weights out of 0.1 and 1. DQN's last
-two runs on the pendulum were left out. That is not the same tuning: what SARSA has besides (munchausen, averages)
-comes from a longer search on the cart-pole, training seeds from 100 on, and rivals had none like it.
+Every method has a network of the same size (an LSTM of 64 between layers of 64, RecurrentPPO one each for policy and
+values; or four frames and no recurrence), the same discount, actions and number of environment steps, and one setting
+for all tasks: the best of a few on the validation episodes of cart-pole positions (50,000 steps) and pendulum position
+(60,000), training seeds 100 and 101. SARSA was tried with learning rates, lambda, reuse and copies (7 settings); DRQN
+and DQN with learning rates, target updates and double Q-learning (5 each); PQN with learning rates, lambda, epochs,
+copies and a soft-max (8); R2D2 with gradient steps, a learning rate and shorter sequences (4, on seed 100 and the
+cart-pole); RecurrentPPO with rl-zoo3's settings for both tasks without velocities, that for the pendulum on seed 100
+only, and two between them (4); SB3's DQN with rl-zoo3's for the cart-pole and two more (3); auxiliary weights out of
+0.1 and 1. DQN's last two runs on the pendulum were left out. That is not the same tuning: what SARSA has besides
+(munchausen, averages) comes from a longer search on the cart-pole, training seeds from 100 on, and rivals had none like
+it.
 
 Steps on acrobot and swing-up were raised, from 30,000 and 50,000, after seed 0 had shown SARSA at the floor there.
 """
